@@ -1,0 +1,91 @@
+# `make help` lists the targets. Needs GNU make and Python 3.11 or newer, and nothing else.
+
+PYTHON ?= python3
+VENV ?= .venv
+# Extra arguments for the command behind a target: make test ARGS="-k orbits", make demo ARGS=--help.
+ARGS ?=
+# Where to take PyTorch from. Linux without a graphics card: a far smaller download with
+#   make setup TORCH_INDEX=https://download.pytorch.org/whl/cpu
+TORCH_INDEX ?=
+
+ifeq ($(OS),Windows_NT)
+RUN := $(VENV)/Scripts/python
+else
+RUN := $(VENV)/bin/python
+endif
+STAMP := $(VENV)/.installed
+# Goes in first and alone: TORCH_INDEX holds PyTorch, not our versions of what it needs.
+TORCH := $(shell sed -n '/^torch==/p' constraints.txt)
+TORCH_FROM := $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX))
+PIP := -m pip --disable-pip-version-check
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test lint format slow reference benchmark constraints clean
+
+help: ## list the targets
+	@echo "Usage: make TARGET [ARGS=...] [PYTHON=python3.12] [TORCH_INDEX=https://download.pytorch.org/whl/cpu]"
+	@echo
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  \1\t\2/p' Makefile | expand -t 16
+
+setup: $(STAMP) ## make .venv and install the project into it, with pinned versions
+
+$(STAMP): pyproject.toml constraints.txt
+	@command -v "$(PYTHON)" >/dev/null 2>&1 || { \
+	  echo "make: '$(PYTHON)' was not found. Install Python 3.11 or newer, or name yours: make setup PYTHON=python3.12" >&2; \
+	  exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "make: '$(PYTHON)' is $$("$(PYTHON)" --version 2>&1), and Python 3.11 or newer is needed." >&2; \
+	  echo "      Name a newer one: make setup PYTHON=python3.12" >&2; \
+	  exit 1; }
+	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "make: '$(PYTHON)' cannot make virtual environments: its venv module is missing." >&2; \
+	  echo "      On Debian and Ubuntu: sudo apt install python3-venv" >&2; \
+	  exit 1; }
+	@"$(RUN)" $(PIP) --version >/dev/null 2>&1 || { \
+	  echo "Making $(VENV) ..."; "$(PYTHON)" -m venv --clear "$(VENV)"; }
+	@"$(RUN)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "make: $(VENV) holds a Python older than 3.11. Remove it (make clean VENV=$(VENV)) and try again." >&2; \
+	  exit 1; }
+	@echo "Installing pinned versions into $(VENV): the first time a few minutes and 1 GB or more, most of it PyTorch ..."
+	"$(RUN)" $(PIP) install -c constraints.txt --no-deps $(TORCH_FROM) $(TORCH)
+	"$(RUN)" $(PIP) install -c constraints.txt -e ".[all,dev]"
+	@touch "$@"
+	@echo "Ready. 'make demo' shows what it does, 'make test' checks it."
+
+demo: setup ## draw the amplitude curve, train both agents, compare them with passive and classical (minutes)
+	"$(RUN)" scripts/demo.py $(ARGS)
+
+test: setup ## run every check and test
+	"$(RUN)" scripts/check.py $(ARGS)
+
+lint: setup ## run every check but the tests
+	"$(RUN)" scripts/check.py --lint-only
+
+format: setup ## let ruff mend and format the code
+	"$(RUN)" -m ruff check --fix .
+	"$(RUN)" -m ruff format .
+
+slow: setup ## run the tests that take minutes
+	"$(RUN)" -m pytest -m slow $(ARGS)
+
+reference: setup ## print the numbers that the project promises, beside what it reaches
+	"$(RUN)" scripts/reference_numbers.py $(ARGS)
+
+benchmark: setup ## measure the speed against other environments on this machine
+	"$(RUN)" scripts/benchmark.py $(ARGS)
+
+# The newest versions that the ranges in pyproject.toml allow, installed on their own and frozen.
+constraints: ## renew constraints.txt from the newest versions (then run make test)
+	"$(PYTHON)" -m venv --clear .venv-newest
+	.venv-newest/bin/python $(PIP) install $(TORCH_FROM) torch
+	.venv-newest/bin/python $(PIP) install -e ".[all,dev]"
+	sed -n '/^#/p' constraints.txt > constraints.new
+	.venv-newest/bin/python $(PIP) freeze --exclude-editable | sed 's/+.*//' >> constraints.new
+	mv constraints.new constraints.txt
+	rm -rf .venv-newest
+
+clean: ## remove .venv, caches, builds and the demo's output (trained runs stay)
+	rm -rf "$(VENV)" .venv-newest build dist demo_output *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

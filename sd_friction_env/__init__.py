@@ -1,0 +1,57 @@
+"""Friction-induced vibration as a control problem: an event-exact SD oscillator on a moving belt.
+
+Importing the package registers its environments with Gymnasium; everything else is loaded when first used.
+"""
+
+import importlib
+from typing import Any
+
+from gymnasium.envs.registration import register
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "OscillatorParameters": "parameters",
+    "Trajectory": "simulation",
+    "simulate": "simulation",
+    "LimitCycle": "orbits",
+    "Equilibrium": "orbits",
+    "OrbitError": "orbits",
+    "limit_cycle": "orbits",
+    "equilibria": "orbits",
+    "critical_belt_speeds": "orbits",
+    "amplitude_curve": "curves",
+    "Table": "tables",
+    "Task": "task",
+    "SDFrictionEnv": "env",
+    "EnvState": "env",
+}
+__all__ = ["ENVIRONMENT_IDS", "__version__", *_PUBLIC]  # noqa: PLE0604 (the names are strings)
+
+# Hidden parameters of the randomised tier, and the sensor of the sensed tier.
+_RANDOMISED: dict[str, Any] = {"randomise": {"belt_speed": (0.1, 0.35), "alpha": (0.6, 0.95), "mu_m": (0.03, 0.12)}}
+_SENSED: dict[str, Any] = {"sensor": "position", "sensor_noise": 0.005, "sensor_delay": 1}
+_TIERS = {"": {}, "Randomised": _RANDOMISED, "Sensed": _SENSED}
+_ACTUATORS = {"Force": "force", "BeltSpeed": "belt_speed"}
+
+ENVIRONMENT_IDS = tuple(f"SDFriction/{name}{tier}-v0" for name in _ACTUATORS for tier in _TIERS)
+
+for _name, _actuator in _ACTUATORS.items():
+    for _tier, _arguments in _TIERS.items():
+        register(
+            id=f"SDFriction/{_name}{_tier}-v0",
+            entry_point="sd_friction_env.env:SDFrictionEnv",
+            kwargs={"actuator": _actuator, **_arguments},
+        )
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

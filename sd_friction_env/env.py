@@ -1,0 +1,554 @@
+"""The friction oscillator as a Gymnasium environment."""
+
+import collections
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Self, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from sd_friction_env import kernel
+from sd_friction_env.orbits import balance_points
+from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_choice, checked_number
+from sd_friction_env.simulation import amplitude
+from sd_friction_env.startup import announced
+from sd_friction_env.task import Task, rig_arguments
+
+RewardFunction = Callable[[Mapping[str, Any]], float]
+
+_ACTUATOR_CODES = {"force": kernel.FORCE, "belt_speed": kernel.BELT_SPEED}
+_OPTIONS = ("parameters", "phase", "start", "v", "x")
+_READOUT_INTERVALS = 100  # the window of the rendered amplitude and stick readouts
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EnvState:
+    """All that an episode's future depends on, besides the actions (see :meth:`SDFrictionEnv.set_state`)."""
+
+    parameters: OscillatorParameters
+    x: float
+    v: float
+    v_belt: float
+    belt_travel: float
+    steps: int
+    ended: bool
+    worst_cost: float
+    key: int
+    episode: int
+    past: tuple[tuple[float, float], ...]
+
+
+class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """
+    ## Description
+
+    A mass on an inclined spring rides on a moving belt. Dry friction that falls with speed (Stribeck) makes it squeal:
+    it sticks to the belt, breaks away, slips back and sticks again. The controller pushes the mass with a small force,
+    or changes the belt's speed a little, to make it stand still on the sliding belt. The motion is integrated
+    event-exactly: while the mass sticks its velocity equals the belt's, to the bit.
+
+    All quantities are dimensionless: lengths in units of the free spring length, time in units of 1/omega0. Source:
+    the self-excited smooth-and-discontinuous (SD) oscillator, Eqs. 4-8, with the stick condition
+    |a_belt + 2 beta v_belt + R(x) - u| <= mu_s N(x).
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`. A finite action outside the box is clipped to it; NaN and infinity are refused.
+
+    | actuator | meaning of action a |
+    |---|---|
+    | `force` | control force u = `force_limit` a, held over the control interval |
+    | `belt_speed` | the belt heads for (1 + `belt_authority` a) v_b, at most `belt_acceleration_limit` fast |
+
+    ## Observation Space
+
+    `Box(-observation_limit, observation_limit, (n,), float32)`, clipped to it; raw values are in `info`.
+
+    | entry | value | present |
+    |---|---|---|
+    | position | (x - x_offset) / x_scale | always |
+    | velocity | v / v_scale | sensor `state` |
+    | belt modulation | (v_belt / belt_speed - 1) / belt_authority | sensor `state` and actuator `belt_speed` |
+    | parameters | each randomised one, its range scaled to [-1, 1], by name | `show_parameters` |
+
+    ## Rewards
+
+    Minus the running cost, averaged over the control interval by the integrator:
+    -( mean v^2 / belt_speed^2 + `w_effort` a^2 + `w_stick` (fraction of the interval stuck) ), where belt_speed is the
+    episode's nominal one. The terms stand in `info` as `reward_vibration`, `reward_effort`, `reward_stick` and
+    `reward_contact_loss`; `reward`, a function of that dictionary, replaces their sum.
+
+    ## Starting State
+
+    `start`: a random phase of the passive limit cycle (`cycle`), the unloaded spring's place of rest (`rest`) or a
+    random state (`random`). `reset(options=...)` takes
+
+    | option | meaning |
+    |---|---|
+    | `parameters` | mapping of parameter names to values for this episode (wins over randomisation) |
+    | `start` | as the argument |
+    | `phase` | phase in [0, 1] of the passive limit cycle, from breakaway |
+    | `x`, `v` | the state itself, each in [-10, 10]; v defaults to the belt speed |
+
+    ## Episode End
+
+    Terminated if the mass loses contact with the belt (N <= 0), at a cost of the steps left times the worst cost per
+    step (at least `contact_loss_cost`). Truncated after `episode_steps` intervals, or if the integrator gives up
+    (`info["status"]`: event or step limit).
+
+    ## Arguments
+
+    `parameters` (an :class:`OscillatorParameters` or a mapping of its fields), `render_mode`, `reward`, and every field
+    of :class:`Task`: `actuator`, `force_limit`, `belt_authority`, `belt_acceleration_limit`, `control_interval`,
+    `episode_steps`, `w_effort`, `w_stick`, `start`, `kick`, `randomise`, `show_parameters`, `sensor`, `sensor_noise`,
+    `sensor_delay`, `contact_loss_cost`, `observation_limit`, `x_offset`, `x_scale`, `v_scale`.
+
+    ```python
+    import gymnasium as gym
+    env = gym.make("sd_friction_env:SDFriction/Force-v0", parameters={"alpha": 0.7}, w_effort=0.2)
+    ```
+
+    ## Version History
+
+    * v0: initial version
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}  # noqa: RUF012 (Gymnasium's own form)
+
+    def __init__(
+        self,
+        parameters: OscillatorParameters | Mapping[str, Any] | None = None,
+        *,
+        render_mode: str | None = None,
+        reward: RewardFunction | None = None,
+        **task_arguments: Any,
+    ) -> None:
+        self.nominal = _as_parameters(parameters)
+        _check_belt(self.nominal)
+        task = Task.from_arguments(task_arguments)
+        if render_mode is not None:
+            checked_choice("render_mode", render_mode, tuple(self.metadata["render_modes"]))
+        if reward is not None and not callable(reward):
+            raise TypeError(f"reward must be a function of the info dictionary or None, got {reward!r}")
+        if task.randomise:  # the corners must be legal before an episode draws them
+            for corner in (0, 1):
+                _check_belt(self.nominal.replace(**{name: ends[corner] for name, ends in task.randomise.items()}))
+        self.render_mode = render_mode
+        self.reward = reward
+        with announced("compiling the oscillator's kernel (once; the result is cached)"):
+            self.task = task.with_scales(self.nominal)
+        self._full_state = task.sensor == "state"
+        self._plain_sensor = self._full_state and task.sensor_noise == 0.0 and task.sensor_delay == 0
+        self._sees_belt = self._full_state and task.actuator == "belt_speed"
+        size = 1 + self._full_state + self._sees_belt + (len(task.randomise) if task.show_parameters else 0)
+        self._limit = self.task.observation_limit
+        self._observation_shape = (size,)
+        self.observation_space = spaces.Box(-self._limit, self._limit, self._observation_shape, np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self._renderer: Any = None
+        self._key: int | None = None
+        self._episode = 0
+        self._steps = -1  # not reset yet
+        self._ended = False
+        self._worst_cost = 0.0
+        self._past: collections.deque[tuple[float, float]] = collections.deque(maxlen=task.sensor_delay + 1)
+        self._window: collections.deque[tuple[float, float, float]] = collections.deque(maxlen=_READOUT_INTERVALS)
+        self._x = self._v = self._v_belt = self._belt_travel = 0.0
+        self._mode = kernel.STICK
+        self._force = 0.0
+        self._use(self.nominal)
+
+    @classmethod
+    def from_rig(
+        cls,
+        *,
+        M: float,
+        K: float,
+        C: float,
+        L: float,
+        H: float,
+        g: float,
+        V0: float,
+        mu_s: float,
+        mu_m: float,
+        V_m: float,
+        sampling_time: float,
+        force_limit: float | None = None,
+        belt_acceleration_limit: float | None = None,
+        **arguments: Any,
+    ) -> Self:
+        """Return an environment made from a rig in SI units.
+
+        Args:
+            M, K, C, L, H, g, V0, mu_s, mu_m, V_m: as :meth:`OscillatorParameters.from_physical` has them.
+            sampling_time: the control interval, s.
+            force_limit: greatest control force, N. belt_acceleration_limit: of the belt, m/s^2.
+            **arguments: any other argument of the class.
+
+        ``env.unwrapped.nominal.time_scale`` (seconds), ``length_scale`` (metres) and ``force_scale`` (newtons) lead
+        back to SI units.
+        """
+        parameters = OscillatorParameters.from_physical(M, K, C, L, H, g, V0, mu_s, mu_m, V_m)
+        rig = rig_arguments(
+            parameters,
+            sampling_time=sampling_time,
+            force_limit=force_limit,
+            belt_acceleration_limit=belt_acceleration_limit,
+        )
+        return cls(parameters, **rig, **arguments)
+
+    @property
+    def parameters(self) -> OscillatorParameters:
+        """The parameters of the present episode."""
+        return self._parameters
+
+    def _use(self, parameters: OscillatorParameters) -> None:
+        task = self.task
+        self._parameters = parameters
+        authority = task.force_limit if task.actuator == "force" else task.belt_authority
+        # All that compiled code needs of plant and task, in its order of arguments: floats pass its border cheaply.
+        self._constants = (
+            *parameters.plant,
+            _ACTUATOR_CODES[task.actuator],
+            authority,
+            task.belt_acceleration_limit,
+            parameters.belt_speed,
+            task.control_interval,
+            task.w_effort,
+            task.w_stick,
+        )
+        assert task.x_offset is not None
+        assert task.x_scale is not None
+        assert task.v_scale is not None
+        self._x_offset, self._x_scale, self._v_scale = task.x_offset, task.x_scale, task.v_scale
+        self._belt_speed = parameters.belt_speed
+        self._belt_authority = task.belt_authority or 1.0
+        self._interval = task.control_interval
+        self._last_step = task.episode_steps
+        self._shown: tuple[float, ...] = ()
+        if task.show_parameters:
+            self._shown = tuple(
+                min(max(2.0 * (getattr(parameters, name) - low) / (high - low) - 1.0, -self._limit), self._limit)
+                if high > low
+                else 0.0
+                for name, (low, high) in task.randomise.items()
+            )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; see the class for ``options``.
+
+        Raises:
+            TypeError, ValueError: if an option is unknown or out of its range; the running episode is then untouched.
+        """
+        options = _checked_options(options)
+        key, episode = self._key, self._episode + 1
+        if seed is not None or key is None:
+            super().reset(seed=seed)
+            key, episode = int(self.np_random.integers(2**62)), 0
+        task = self.task
+        parameters = task.drawn_parameters(self.nominal, key, episode)
+        if "parameters" in options:
+            parameters = parameters.replace(**options["parameters"])
+            _check_belt(parameters)
+        if "start" in options:
+            task = dataclasses.replace(task, start=options["start"])
+        with announced("compiling the oscillator's kernel (once; the result is cached)"):
+            if "x" in options:
+                x, v = options["x"], options.get("v", parameters.belt_speed)
+            elif "phase" in options:
+                x, v = task.cycle_state(parameters, options["phase"])
+            else:
+                x, v = task.start_state(parameters, key, episode)
+        self._key, self._episode = key, episode
+        self._use(parameters)
+        self._x, self._v, self._v_belt = x, v, parameters.belt_speed
+        self._belt_travel = 0.0
+        self._steps = 0
+        self._ended = False
+        self._worst_cost = 0.0
+        self._mode = kernel.mode_of(parameters.plant, x, v, parameters.belt_speed, 0.0, 0.0)
+        self._force = 0.0
+        self._past.clear()
+        self._window.clear()
+        if self._renderer is not None:
+            self._renderer.clear_trail()
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), {
+            "x": x,
+            "v": v,
+            "v_belt": self._v_belt,
+            "v_rel": v - self._v_belt,
+            "mode": self._mode,
+            "normal_force": kernel.spring(parameters.plant, x)[1],
+            "time": 0.0,
+            "parameters": dataclasses.asdict(parameters),
+        }
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
+        """Hold an action for one control interval; see the class for what is returned.
+
+        Raises:
+            TypeError, ValueError: if the action is not one finite number in an array of shape (1,).
+            gymnasium.error.ResetNeeded: before the first reset, and after contact was lost.
+        """
+        if self._steps < 0 or self._ended:
+            raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
+        try:
+            a = action.item() if action.shape == (1,) else math.nan
+            if not -1.0 <= a <= 1.0:
+                a = _clipped_action(action)
+        except (AttributeError, TypeError):
+            a = _clipped_action(action)
+        (
+            x,
+            v,
+            v_belt,
+            mode,
+            status,
+            events,
+            force,
+            a_belt,
+            vibration,
+            effort,
+            stick,
+            mean_v2,
+            stick_fraction,
+            friction_power,
+            control_power,
+            x_min,
+            x_max,
+            normal_force,
+        ) = kernel.control_interval(*self._constants, self._x, self._v, self._v_belt, a)
+        self._belt_travel += 0.5 * (self._v_belt + v_belt) * self._interval
+        self._x = x
+        self._v = v
+        self._v_belt = v_belt
+        self._mode = mode
+        self._force = force
+        self._steps += 1
+        reward = vibration + effort + stick
+        if -reward > self._worst_cost:
+            self._worst_cost = -reward
+        terminated = False
+        truncated = self._steps >= self._last_step
+        contact_loss = 0.0
+        if status != kernel.OK:
+            self._ended = True
+            terminated = status == kernel.CONTACT_LOST
+            truncated = truncated or not terminated
+            if terminated:
+                steps_left = max(0, self._last_step - self._steps) + 1
+                contact_loss = -steps_left * max(self.task.contact_loss_cost, self._worst_cost)
+                reward += contact_loss
+        info = {
+            "x": x,
+            "v": v,
+            "v_belt": v_belt,
+            "v_rel": v - v_belt,
+            "mode": mode,
+            "normal_force": normal_force,
+            "time": self._steps * self._interval,
+            "action": a,
+            "force": force,
+            "belt_acceleration": a_belt,
+            "x_min": x_min,
+            "x_max": x_max,
+            "mean_square_velocity": mean_v2,
+            "stick_fraction": stick_fraction,
+            "friction_power": friction_power,
+            "control_power": control_power,
+            "events": events,
+            "status": kernel.STATUS_NAMES[status],
+            "reward_vibration": vibration,
+            "reward_effort": effort,
+            "reward_stick": stick,
+            "reward_contact_loss": contact_loss,
+        }
+        if self.reward is not None:
+            reward = float(self.reward(info))
+        if self.render_mode is not None:
+            self._window.append((x_min, x_max, stick_fraction))
+            if self.render_mode == "human":
+                self.render()
+        return self._observation(), reward, terminated, truncated, info
+
+    def _observation(self) -> NDArray[np.float32]:
+        x, v = self._x, self._v
+        if not self._plain_sensor:
+            x, v = self._sensed()
+        limit = self._limit
+        observation = np.empty(self._observation_shape, np.float32)
+        value = (x - self._x_offset) / self._x_scale
+        observation[0] = value if -limit <= value <= limit else math.copysign(limit, value)
+        place = 1
+        if self._full_state:
+            value = v / self._v_scale
+            observation[1] = value if -limit <= value <= limit else math.copysign(limit, value)
+            place = 2
+            if self._sees_belt:
+                value = (self._v_belt / self._belt_speed - 1.0) / self._belt_authority
+                observation[2] = value if -limit <= value <= limit else math.copysign(limit, value)
+                place = 3
+        if self._shown:
+            observation[place:] = self._shown
+        return observation
+
+    def _sensed(self) -> tuple[float, float]:
+        """Return x and v as the sensor gives them: some intervals old, with the noise of the interval they are from."""
+        x, v = self._x, self._v
+        if self.task.sensor_noise > 0.0:
+            assert self._key is not None
+            x += self.task.sensor_noise * kernel.random_normal(self._key, self._episode, self._steps + 1, 0)
+            v += self.task.sensor_noise * kernel.random_normal(self._key, self._episode, self._steps + 1, 1)
+        self._past.append((x, v))
+        return self._past[0]
+
+    def get_state(self) -> EnvState:
+        """Return all that the running episode's future depends on, for planning.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self._steps < 0 or self._key is None:
+            raise gym.error.ResetNeeded("call reset() before get_state(): there is no state yet")
+        return EnvState(
+            parameters=self._parameters,
+            x=self._x,
+            v=self._v,
+            v_belt=self._v_belt,
+            belt_travel=self._belt_travel,
+            steps=self._steps,
+            ended=self._ended,
+            worst_cost=self._worst_cost,
+            key=self._key,
+            episode=self._episode,
+            past=tuple(self._past),
+        )
+
+    def set_state(self, state: EnvState) -> None:
+        """Go back to a state that :meth:`get_state` returned: what follows is the same, bit for bit.
+
+        Raises:
+            TypeError: if it is not an :class:`EnvState`.
+        """
+        if not isinstance(state, EnvState):
+            raise TypeError(f"state must be an EnvState as get_state() returns it, got {state!r}")
+        self._use(state.parameters)
+        self._x, self._v, self._v_belt = state.x, state.v, state.v_belt
+        self._belt_travel = state.belt_travel
+        self._steps = state.steps
+        self._ended = state.ended
+        self._worst_cost = state.worst_cost
+        self._key, self._episode = state.key, state.episode
+        self._past.clear()
+        self._past.extend(state.past)
+        self._mode = kernel.mode_of(state.parameters.plant, state.x, state.v, state.v_belt, 0.0, 0.0)
+
+    def render(self) -> Any:
+        """Draw the present state; an array of shape (height, width, 3), uint8, in mode "rgb_array"."""
+        if self.render_mode is None:
+            gym.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array' or 'human'")
+            return None
+        from sd_friction_env.rendering import Renderer, Scene
+
+        if self._renderer is None:
+            self._renderer = Renderer(self.render_mode, fps=self.metadata["render_fps"])
+        p, task = self._parameters, self.task
+        load = 2.0 * p.beta * self._v_belt
+        ends = [balance_points(p, load, sign * p.mu_s) for sign in (-1.0, 1.0)]
+        interval = (ends[0][-1], ends[1][-1]) if ends[0] and ends[1] else None
+        lows, highs, sticks = zip(*self._window, strict=True) if self._window else ((self._x,), (self._x,), (0.0,))
+        by_belt = task.belt_authority * p.belt_speed if task.actuator == "belt_speed" else 0.0
+        return self._renderer.draw(
+            Scene(
+                time=max(self._steps, 0) * self._interval,
+                x=self._x,
+                v=self._v,
+                v_belt=self._v_belt,
+                mode=self._mode,
+                belt_travel=self._belt_travel,
+                force=self._force,
+                force_limit=task.force_limit if task.actuator == "force" else 0.0,
+                belt_speed_nominal=p.belt_speed,
+                belt_speed_limits=(p.belt_speed - by_belt, p.belt_speed + by_belt),
+                alpha=p.alpha,
+                geometry=p.geometry,
+                stick_interval=interval,
+                amplitude=amplitude(min(lows), max(highs)),
+                stick_fraction=sum(sticks) / len(sticks),
+            )
+        )
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+def _as_parameters(parameters: Any) -> OscillatorParameters:
+    if parameters is None:
+        return OscillatorParameters()
+    if isinstance(parameters, OscillatorParameters):
+        return parameters
+    if isinstance(parameters, Mapping):
+        return OscillatorParameters().replace(**parameters)
+    raise TypeError(f"parameters must be OscillatorParameters or a mapping of its fields, got {parameters!r}")
+
+
+def _check_belt(parameters: OscillatorParameters) -> None:
+    if parameters.belt_speed <= 0.0:
+        raise ValueError(
+            f"belt_speed must be positive in an environment (its reward is measured against it), "
+            f"got {parameters.belt_speed!r}"
+        )
+
+
+def _clipped_action(action: Any) -> float:
+    """Return a finite action clipped to [-1, 1], whatever kind of array or sequence of one number it came in."""
+    expected = "action must be one finite number in an array of shape (1,)"
+    try:
+        array = np.asarray(action, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"{expected}, got {action!r}") from None
+    if array.shape != (1,):
+        raise ValueError(f"{expected}, got shape {array.shape}: {action!r}")
+    if not np.isfinite(array[0]):
+        raise ValueError(f"{expected}; outside [-1, 1] it is clipped; got {action!r}")
+    return float(min(max(array[0], -1.0), 1.0))
+
+
+def _checked_options(options: Any) -> dict[str, Any]:
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise TypeError(f"options must be a mapping or None, got {options!r}")
+    unknown = sorted(str(name) for name in options if name not in _OPTIONS)
+    if unknown:
+        raise ValueError(f"unknown option {unknown[0]!r}; allowed: {', '.join(_OPTIONS)}")
+    checked = dict(options)
+    if "parameters" in checked:
+        given = checked["parameters"]
+        if isinstance(given, OscillatorParameters):
+            checked["parameters"] = dataclasses.asdict(given)
+        elif not isinstance(given, Mapping):
+            raise TypeError(f"options['parameters'] must map parameter names to values, got {given!r}")
+    for name in ("x", "v"):
+        if name in checked:
+            checked[name] = checked_number(f"options[{name!r}]", checked[name], -STATE_LIMIT, STATE_LIMIT)
+    if "v" in checked and "x" not in checked:
+        raise ValueError(f"options['v'] = {checked['v']!r} needs options['x'] beside it")
+    if "phase" in checked:
+        checked["phase"] = checked_number("options['phase']", checked["phase"], 0.0, 1.0)
+    if sum(name in checked for name in ("x", "phase", "start")) > 1:
+        raise ValueError(f"options 'x', 'phase' and 'start' exclude one another, got {dict(options)!r}")
+    return checked

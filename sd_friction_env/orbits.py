@@ -1,0 +1,428 @@
+"""Equilibria, limit cycles and critical belt speeds of the passive oscillator, found as roots and closed loops.
+
+A trajectory that sticks forgets its past, so a stick-slip cycle closes as soon as a breakaway point repeats. A
+pure-slip cycle is a fixed point of the map from one maximum of x to the next. Neither needs a long transient, which
+matters near the end of oscillation, where transients decay ever more slowly.
+"""
+
+import cmath
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Self
+
+import numpy as np
+from scipy.optimize import brentq
+
+from sd_friction_env import kernel
+from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_number
+from sd_friction_env.simulation import amplitude
+
+Kind = Literal["stick-slip", "pure-slip", "steady-slip", "rest"]
+
+_SETTLING_LAPS = 30
+_LONG_SETTLING_LAPS = 3000
+_SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are called the equilibrium
+_EXITS = 64
+
+
+class OrbitError(ValueError):
+    """The passive motion has no attractor that can be named: it loses contact, or does not settle."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Equilibrium:
+    """A steady-slip equilibrium: the mass stands still, the belt slides under it (Eq. 11).
+
+    Attributes:
+        x: its place. eigenvalues: of the linearised slip motion. stable: whether both have negative real parts.
+    """
+
+    x: float
+    eigenvalues: tuple[complex, complex]
+    stable: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitCycle:
+    """An attractor of the passive oscillator (dimensionless; a steady state has amplitude 0 and no period).
+
+    Attributes:
+        kind: "stick-slip", "pure-slip", "steady-slip" (the mass stands on the sliding belt) or "rest" (belt speed 0).
+        amplitude: (x_max - x_min)/2.
+        period, frequency, angular_frequency: T, 1/T and 2 pi/T; NaN for a steady state.
+        stick_fraction: share of the period spent stuck.
+        x_max, x_min: extremes of x.
+        mean_square_velocity: mean of x'^2 over a period.
+        x_phase0, v_phase0: the state counted as phase 0: breakaway in stick-slip, the maximum of x in pure slip.
+        x_breakaway, x_restick: where stick ends and where it last began; NaN without stick.
+        sticks, forward_arcs: how many sticks and forward-slip arcs one period has.
+        floquet_multiplier: 0 for stick-slip (superstable), the return map's slope for pure slip, NaN otherwise.
+        x_start, v_start: the start whose attractor this is.
+        parameters: of the oscillator.
+    """
+
+    kind: Kind
+    amplitude: float
+    period: float
+    frequency: float
+    angular_frequency: float
+    stick_fraction: float
+    x_max: float
+    x_min: float
+    mean_square_velocity: float
+    x_phase0: float
+    v_phase0: float
+    x_breakaway: float
+    x_restick: float
+    sticks: int
+    forward_arcs: int
+    floquet_multiplier: float
+    x_start: float
+    v_start: float
+    parameters: OscillatorParameters
+
+    def state(self, phase: float) -> tuple[float, float]:
+        """Return (x, v) at ``phase`` in [0, 1) of the period, counted from ``x_phase0``; a steady state has but one."""
+        phase = checked_number("phase", phase, 0.0, 1.0)
+        if not self.period > 0.0:
+            return self.x_phase0, self.v_phase0
+        p = self.parameters
+        end = kernel.advance(p.plant, self.x_phase0, self.v_phase0, p.belt_speed, 0.0, 0.0, phase * self.period, None)
+        return end[0], end[1]
+
+
+class CriticalBeltSpeeds(NamedTuple("_CriticalBeltSpeeds", [("v_b0", float), ("v_b1", float)])):
+    """The pair (v_b0, v_b1), with ``reason`` saying why where a value is NaN (empty otherwise)."""
+
+    reason: str
+
+    def __new__(cls, v_b0: float, v_b1: float, reason: str = "") -> Self:
+        pair = super().__new__(cls, v_b0, v_b1)
+        pair.reason = reason
+        return pair
+
+
+def balance_points(parameters: OscillatorParameters, load: float, coefficient: float) -> list[float]:
+    """Return every x with load + R(x) = coefficient N(x), in ascending order.
+
+    With load 0 and the kinetic coefficient these are the steady-slip equilibria (Eq. 11); with load 2 beta v_b and
+    +-mu_s they are the ends of the stick intervals (Eq. 8, corrected).
+    """
+    alpha, g1 = parameters.alpha, parameters.g1
+    if parameters.geometry == "linear":
+        return [coefficient * g1 - load]
+    if parameters.geometry == "cubic":
+        square = alpha * alpha
+        polynomial = [
+            0.5 / (square * alpha),
+            0.5 * coefficient / square,
+            1.0 - 1.0 / alpha,
+            load - coefficient * (g1 - alpha + 1.0),
+        ]
+    else:
+        # (x - c) s = x + m alpha with s = sqrt(x^2 + alpha^2); squared, a quartic with foreign roots among its own
+        c = coefficient * (g1 - alpha) - load
+        left = np.polymul(np.polymul([1.0, -c], [1.0, -c]), [1.0, 0.0, alpha * alpha])
+        right = np.polymul([1.0, coefficient * alpha], [1.0, coefficient * alpha])
+        polynomial = list(np.polysub(left, right))
+    plant = parameters.plant
+
+    points: list[float] = []
+    for root in np.roots(polynomial):
+        if abs(root.imag) > 1e-6 * max(1.0, abs(root.real)):
+            continue
+        x = float(root.real)
+        for _ in range(8):
+            restoring, normal = kernel.spring(plant, x)
+            restoring_slope, normal_slope = kernel.spring_slopes(plant, x)
+            slope = restoring_slope - coefficient * normal_slope
+            if slope == 0.0:
+                break
+            x -= (load + restoring - coefficient * normal) / slope
+        restoring, normal = kernel.spring(plant, x)
+        error = abs(load + restoring - coefficient * normal)
+        size = 1.0 + abs(load) + abs(restoring) + abs(coefficient * normal)
+        # Squaring and a wandering Newton iteration can both bring in roots that are none, or one twice.
+        near = abs(x - root.real) < 1e-3 * max(1.0, abs(x))
+        if error < 1e-9 * size and near and all(abs(x - other) > 1e-9 for other in points):
+            points.append(x)
+    return sorted(points)
+
+
+def equilibria(parameters: OscillatorParameters) -> list[Equilibrium]:
+    """Return the steady-slip equilibria (v_rel = -v_b), in ascending order of x, with contact and belt moving.
+
+    Source: Eq. 11 for the cubic geometry; the same balance of forces for the others.
+    """
+    speed = parameters.belt_speed
+    if speed == 0.0:
+        return []
+    plant = parameters.plant
+    coefficient = -float(kernel.friction_coefficient(plant, kernel.SLIP_BACKWARD, -speed))
+    slope = float(kernel.friction_slope(plant, kernel.SLIP_BACKWARD, -speed))
+    found = []
+    for x in balance_points(parameters, 0.0, coefficient):
+        normal = kernel.spring(plant, x)[1]
+        if normal <= 0.0:
+            continue
+        restoring_slope, normal_slope = kernel.spring_slopes(plant, x)
+        stiffness = restoring_slope - coefficient * normal_slope
+        damping = 2.0 * parameters.beta + normal * slope
+        root = cmath.sqrt(damping * damping - 4.0 * stiffness)
+        pair = (0.5 * (-damping + root), 0.5 * (-damping - root))
+        found.append(Equilibrium(x=x, eigenvalues=pair, stable=damping > 0.0 and stiffness > 0.0))
+    return found
+
+
+def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | None = None) -> LimitCycle:
+    """Return the attractor that the passive oscillator reaches from (x, v).
+
+    Args:
+        parameters: of the oscillator.
+        x, v: the start, in [-10, 10]; without them a mass set down at x = 0 moving with the belt.
+
+    Raises:
+        OrbitError: if the motion loses contact (N <= 0) or does not settle.
+        TypeError, ValueError: if x or v is not a number in its range.
+    """
+    x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
+    v = parameters.belt_speed if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
+    at_x, at_v = x, v
+    laps = _SETTLING_LAPS
+    for _ in range(40):
+        outcome, place, previous, lowest = kernel.settle(
+            parameters.plant, parameters.belt_speed, at_x, at_v, laps, np.empty(_EXITS)
+        )
+        if outcome == kernel.REPEATED_BREAKAWAY:
+            return _stick_slip(parameters, place, x, v)
+        if outcome == kernel.AT_REST:
+            return _steady(parameters, "rest", place, x, v)
+        if outcome == kernel.ORBIT_LOST_CONTACT:
+            raise OrbitError(f"the mass loses contact with the belt at x = {place:.6g} (N <= 0); {parameters}")
+        if outcome == kernel.ORBIT_UNDECIDED:
+            break
+        around = [e for e in equilibria(parameters) if lowest <= e.x <= place]
+        if abs(place - previous) < kernel.TIME_ZERO and place - lowest > _SMALLEST_RADIUS:
+            return _pure_slip(parameters, place, x, v)
+        if not around:
+            at_x, at_v, laps = place, 0.0, _LONG_SETTLING_LAPS
+            if abs(place - previous) < _SMALLEST_RADIUS:
+                return _steady(parameters, "steady-slip", place, x, v)
+            continue
+        verdict, place = _limit_of_slip(parameters, place, place > previous, around)
+        if verdict == "pure-slip":
+            return _pure_slip(parameters, place, x, v)
+        if verdict == "steady-slip":
+            return _steady(parameters, "steady-slip", place, x, v)
+        at_x, at_v = place, 0.0
+    raise OrbitError(f"the motion from x = {x!r}, v = {v!r} does not settle; {parameters}")
+
+
+def _limit_of_slip(
+    parameters: OscillatorParameters, maximum: float, growing: bool, around: list[Equilibrium]
+) -> tuple[str, float]:
+    """Return where successive maxima of x tend from ``maximum``: ("pure-slip", fixed point), ("steady-slip", x) or
+    ("on", a maximum on the way, beyond which the motion sticks or circles other equilibria)."""
+    plant, speed = parameters.plant, parameters.belt_speed
+    centre = around[-1].x
+
+    def shift(radius: float) -> float:
+        """How much one lap adds to the radius; NaN if the lap sticks or circles other equilibria."""
+        event, following, low, _, _ = kernel.next_maximum(plant, speed, centre + radius)
+        if event != kernel.TURNING or not low <= around[0].x:
+            return math.nan
+        return float(following - centre - radius)
+
+    radius = maximum - centre
+    if growing:
+        for _ in range(400):
+            further = 1.1 * radius
+            change = shift(further)
+            if change < 0.0:
+                return "pure-slip", centre + _root(shift, radius, further)
+            if math.isnan(change):
+                # Just inside of the largest orbit that does not stick there can still be a cycle.
+                inside, outside = radius, further
+                while outside - inside > 4.0 * math.ulp(outside):
+                    middle = 0.5 * (inside + outside)
+                    if math.isnan(shift(middle)):
+                        outside = middle
+                    else:
+                        inside = middle
+                    if middle in (inside, outside) and outside - inside <= 1e-15:
+                        break
+                if shift(inside) < 0.0:
+                    return "pure-slip", centre + _root(shift, radius, inside)
+                return "on", centre + further
+            radius = further
+        return "on", centre + radius
+    while radius > _SMALLEST_RADIUS:
+        smaller = 0.7 * radius
+        change = shift(smaller)
+        if change > 0.0:
+            return "pure-slip", centre + _root(shift, smaller, radius)
+        if math.isnan(change):
+            return "on", centre + smaller
+        radius = smaller
+    return "steady-slip", centre
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    return float(brentq(function, low, high, xtol=1e-15, rtol=1e-14))
+
+
+def _stick_slip(parameters: OscillatorParameters, x_exit: float, x: float, v: float) -> LimitCycle:
+    outcome, period, stick_time, x_min, x_max, x_restick, sticks, arcs, int_v2 = kernel.stick_slip_lap(
+        parameters.plant, parameters.belt_speed, x_exit
+    )
+    if outcome != kernel.REPEATED_BREAKAWAY:
+        raise OrbitError(f"the stick-slip cycle from breakaway at x = {x_exit!r} does not close; {parameters}")
+    return LimitCycle(
+        kind="stick-slip",
+        amplitude=amplitude(x_min, x_max),
+        period=period,
+        frequency=1.0 / period,
+        angular_frequency=2.0 * math.pi / period,
+        stick_fraction=stick_time / period,
+        x_max=x_max,
+        x_min=x_min,
+        mean_square_velocity=int_v2 / period,
+        x_phase0=x_exit,
+        v_phase0=parameters.belt_speed,
+        x_breakaway=x_exit,
+        x_restick=x_restick,
+        sticks=sticks,
+        forward_arcs=arcs,
+        floquet_multiplier=0.0,
+        x_start=x,
+        v_start=v,
+        parameters=parameters,
+    )
+
+
+def _pure_slip(parameters: OscillatorParameters, x_max: float, x: float, v: float) -> LimitCycle:
+    plant, speed = parameters.plant, parameters.belt_speed
+    _, _, x_min, period, int_v2 = kernel.next_maximum(plant, speed, x_max)
+    step = 1e-4 * (x_max - x_min)
+    above = kernel.next_maximum(plant, speed, x_max + step)[1]
+    below = kernel.next_maximum(plant, speed, x_max - step)[1]
+    multiplier = (above - below) / (2.0 * step)
+    if math.isnan(multiplier):  # the orbit just above sticks
+        multiplier = (x_max - below) / step
+    return LimitCycle(
+        kind="pure-slip",
+        amplitude=amplitude(x_min, x_max),
+        period=period,
+        frequency=1.0 / period,
+        angular_frequency=2.0 * math.pi / period,
+        stick_fraction=0.0,
+        x_max=x_max,
+        x_min=x_min,
+        mean_square_velocity=int_v2 / period,
+        x_phase0=x_max,
+        v_phase0=0.0,
+        x_breakaway=math.nan,
+        x_restick=math.nan,
+        sticks=0,
+        forward_arcs=0,
+        floquet_multiplier=multiplier,
+        x_start=x,
+        v_start=v,
+        parameters=parameters,
+    )
+
+
+def _steady(parameters: OscillatorParameters, kind: Kind, place: float, x: float, v: float) -> LimitCycle:
+    return LimitCycle(
+        kind=kind,
+        amplitude=0.0,
+        period=math.nan,
+        frequency=math.nan,
+        angular_frequency=math.nan,
+        stick_fraction=1.0 if kind == "rest" else 0.0,
+        x_max=place,
+        x_min=place,
+        mean_square_velocity=0.0,
+        x_phase0=place,
+        v_phase0=0.0,
+        x_breakaway=math.nan,
+        x_restick=math.nan,
+        sticks=0,
+        forward_arcs=0,
+        floquet_multiplier=math.nan,
+        x_start=x,
+        v_start=v,
+        parameters=parameters,
+    )
+
+
+def hopf_belt_speed(parameters: OscillatorParameters) -> float:
+    """Return v_b1, the largest belt speed at which steady slip loses its stability, or NaN if it never does.
+
+    The root of 2 beta + N(x_bar) mu'(-v_b) = 0 at the right-most equilibrium x_bar(v_b). ``belt_speed`` is not used.
+    """
+    plant = parameters.plant
+
+    def damping(speed: float) -> float:
+        coefficient = -kernel.friction_coefficient(plant, kernel.SLIP_BACKWARD, -speed)
+        points = balance_points(parameters, 0.0, coefficient)
+        if not points:
+            return math.nan
+        normal = kernel.spring(plant, points[-1])[1]
+        return float(2.0 * parameters.beta + normal * kernel.friction_slope(plant, kernel.SLIP_BACKWARD, -speed))
+
+    high = parameters.v_m  # friction rises with speed from here on
+    for low in np.linspace(high, 0.0, 65)[1:]:
+        if damping(float(low)) < 0.0:
+            return float(brentq(damping, low, high, xtol=1e-14, rtol=1e-14)) if damping(high) > 0.0 else high
+        high = float(low)
+    return math.nan
+
+
+def grazing_belt_speed(parameters: OscillatorParameters) -> float:
+    """Return v_b0, the largest belt speed at which a mass that breaks away sticks again, or NaN if it never does.
+
+    The mass breaks away at the right end of the right-most stick interval. ``belt_speed`` is not used.
+    """
+    plant = parameters.plant
+
+    def sticks_again(speed: float) -> bool:
+        ends = balance_points(parameters, 2.0 * parameters.beta * speed, parameters.mu_s)
+        if not ends or kernel.spring(plant, ends[-1])[1] <= 0.0:
+            return False
+        return bool(kernel.slip_returns_to_stick(plant, speed, ends[-1]))
+
+    high = 1.5 * parameters.v_m
+    for low in np.linspace(high, 0.0, 97)[1:-1]:
+        if sticks_again(float(low)):
+            inside, outside = float(low), high
+            while True:
+                middle = 0.5 * (inside + outside)
+                if not inside < middle < outside:
+                    return inside
+                if sticks_again(middle):
+                    inside = middle
+                else:
+                    outside = middle
+        high = float(low)
+    return math.nan
+
+
+def critical_belt_speeds(parameters: OscillatorParameters) -> CriticalBeltSpeeds:
+    """Return (v_b0, v_b1): the belt speeds at which stick-slip ends (grazing) and at which oscillation ends (Hopf).
+
+    The result is a pair with an attribute ``reason``, which says why where a value is NaN. ``parameters.belt_speed``
+    is not used. alpha < 1 has several wells: the speeds are those of the right-hand well, where the belt takes a mass.
+    """
+    v_b1 = hopf_belt_speed(parameters)
+    if math.isnan(v_b1):
+        return CriticalBeltSpeeds(
+            math.nan,
+            math.nan,
+            "nothing oscillates: damping outweighs the falling friction at every belt speed, "
+            "2 beta + N mu'(-v_b) >= 0 (on a level spring: (mu_s - mu_m)/v_m <= 4 beta/(3 N))",
+        )
+    v_b0 = grazing_belt_speed(parameters)
+    reason = "no breakaway is followed by another stick" if math.isnan(v_b0) else ""
+    return CriticalBeltSpeeds(v_b0, v_b1, reason)

@@ -1,0 +1,188 @@
+"""The oscillator's parameters as a person types them: checked, frozen, and convertible from a rig in SI units."""
+
+import dataclasses
+import math
+import numbers
+from dataclasses import dataclass
+from typing import Any, Literal, Self, get_args
+
+from sd_friction_env import kernel
+
+Geometry = Literal["exact", "cubic", "linear"]
+
+GEOMETRIES: tuple[Geometry, ...] = get_args(Geometry)
+_GEOMETRY_CODES = {"exact": kernel.EXACT, "cubic": kernel.CUBIC, "linear": kernel.LINEAR}
+
+# What is accepted, both ends included.
+RANGES: dict[str, tuple[float, float]] = {
+    "alpha": (1e-3, 10.0),
+    "g1": (1e-3, 100.0),
+    "beta": (0.0, 10.0),
+    "mu_s": (0.0, 10.0),
+    "mu_m": (0.0, 10.0),
+    "v_m": (1e-2, 100.0),
+    "belt_speed": (0.0, 10.0),
+    "time_scale": (1e-12, 1e12),
+    "length_scale": (1e-12, 1e12),
+    "force_scale": (1e-12, 1e18),
+}
+STATE_LIMIT = 10.0  # |x| and |v| of a start
+
+
+def checked_number(name: str, value: Any, low: float, high: float) -> float:
+    """Return ``value`` as a float.
+
+    Raises:
+        TypeError: if it is not a real number.
+        ValueError: if it is not finite or not in [low, high].
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise TypeError(f"{name} must be a real number in [{low:g}, {high:g}], got {value!r} ({type(value).__name__})")
+    number = float(value)
+    if not low <= number <= high:  # refuses NaN too
+        raise ValueError(f"{name} must be a finite number in [{low:g}, {high:g}], got {number!r}")
+    return number
+
+
+def checked_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
+    """Return ``value`` if it is one of ``choices``.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
+    return str(value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OscillatorParameters:
+    """Parameters of the self-excited SD oscillator (dimensionless; defaults: the nominal plant).
+
+    The equation of motion is x'' = -2 beta x' - R(x) - mu(x' - v_belt) N(x) + u, with lengths in units of the free
+    spring length and time in units of 1/omega0 (the paper's Eq. 4).
+
+    Attributes:
+        geometry: "exact" (R and N of Eq. 4), "cubic" (their Taylor polynomials, Eq. 9: what the paper's figures show)
+            or "linear" (R = x, N = g1: the belt of Thomsen and Fidlin).
+        alpha: height of the spring's anchor over the belt, H/L, in [0.001, 10]; unused by "linear".
+        g1: weight, g/(L omega0^2), in [0.001, 100].
+        beta: damping ratio, C/(2 M omega0), in [0, 10].
+        mu_s: static friction coefficient, in [0, 10].
+        mu_m: least kinetic friction coefficient, in [0, mu_s].
+        v_m: relative speed at which friction is least, in [0.01, 100].
+        belt_speed: the belt's speed v_b, in [0, 10].
+        time_scale: seconds per unit of time, 1/omega0 (1 unless made by :meth:`from_physical`).
+        length_scale: metres per unit of length, L (1 unless made by :meth:`from_physical`).
+        force_scale: newtons per unit of force, K L (1 unless made by :meth:`from_physical`).
+
+    Raises:
+        TypeError: if a value is not of the kind said above.
+        ValueError: if a value lies outside its range.
+    """
+
+    geometry: Geometry = "exact"
+    alpha: float = 0.8
+    g1: float = 1.0
+    beta: float = 0.05
+    mu_s: float = 0.2
+    mu_m: float = 0.05
+    v_m: float = 0.5
+    belt_speed: float = 0.2
+    time_scale: float = 1.0
+    length_scale: float = 1.0
+    force_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        checked_choice("geometry", self.geometry, GEOMETRIES)
+        for name, (low, high) in RANGES.items():
+            object.__setattr__(self, name, checked_number(name, getattr(self, name), low, high))
+        if self.mu_m > self.mu_s:
+            raise ValueError(f"mu_m must not exceed mu_s = {self.mu_s!r}, got {self.mu_m!r}")
+
+    @classmethod
+    def from_physical(
+        cls,
+        M: float,
+        K: float,
+        C: float,
+        L: float,
+        H: float,
+        g: float,
+        V0: float,
+        mu_s: float,
+        mu_m: float,
+        V_m: float,
+        *,
+        geometry: Geometry = "exact",
+    ) -> Self:
+        """Return the dimensionless parameters of a rig given in SI units (the paper's list above Eq. 4).
+
+        Args:
+            M: mass, kg. K: spring stiffness, N/m. C: damping coefficient, N s/m. L: free length of the spring, m.
+            H: height of its anchor over the belt, m. g: acceleration of gravity, m/s^2. V0: belt speed, m/s.
+            mu_s, mu_m: friction coefficients. V_m: relative speed at which friction is least, m/s.
+            geometry: as in the class.
+
+        The results' ``time_scale``, ``length_scale`` and ``force_scale`` lead back: t = time_scale tau,
+        X = length_scale x, dX/dt = length_scale / time_scale x', F = force_scale u.
+
+        Raises:
+            TypeError, ValueError: as the class does; M, K, L, g and V_m must be positive.
+        """
+        positive = {"M": M, "K": K, "L": L, "g": g, "V_m": V_m}
+        for name, value in positive.items():
+            positive[name] = checked_number(name, value, math.ulp(0.0), 1e12)
+        for name, value in {"C": C, "H": H, "V0": V0}.items():
+            checked_number(name, value, 0.0, 1e12)
+        omega0 = math.sqrt(K / M)
+        return cls(
+            geometry=geometry,
+            alpha=H / L,
+            g1=g / (L * omega0 * omega0),
+            beta=C / (2.0 * M * omega0),
+            mu_s=mu_s,
+            mu_m=mu_m,
+            v_m=V_m / (L * omega0),
+            belt_speed=V0 / (L * omega0),
+            time_scale=1.0 / omega0,
+            length_scale=L,
+            force_scale=K * L,
+        )
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some values changed, checked anew."""
+        unknown = set(changes) - {field.name for field in dataclasses.fields(self)}
+        if unknown:
+            names = ", ".join(field.name for field in dataclasses.fields(self))
+            raise ValueError(f"unknown parameter {sorted(unknown)[0]!r}; allowed: {names}")
+        return dataclasses.replace(self, **changes)
+
+    @property
+    def k1(self) -> float:
+        """Linear coefficient of the Stribeck law, 3/2 (mu_s - mu_m)/v_m (below Eq. 5)."""
+        return 1.5 * (self.mu_s - self.mu_m) / self.v_m
+
+    @property
+    def k3(self) -> float:
+        """Cubic coefficient of the Stribeck law, 1/2 (mu_s - mu_m)/v_m^3 (below Eq. 5)."""
+        return 0.5 * (self.mu_s - self.mu_m) / (self.v_m * self.v_m * self.v_m)
+
+    @property
+    def plant(self) -> kernel.Plant:
+        """The values that compiled code takes."""
+        code = _GEOMETRY_CODES[self.geometry]
+        return kernel.Plant(code, self.alpha, self.g1, self.beta, self.mu_s, self.k1, self.k3)
+
+    def restoring_force(self, x: float) -> float:
+        """Return R(x)."""
+        return float(kernel.spring(self.plant, float(x))[0])
+
+    def normal_force(self, x: float) -> float:
+        """Return N(x)."""
+        return float(kernel.spring(self.plant, float(x))[1])
+
+    def friction_coefficient(self, v_rel: float) -> float:
+        """Return mu(v_rel) of Eq. 5; at v_rel = 0, where it is set-valued, 0."""
+        mode = (v_rel > 0) - (v_rel < 0)
+        return float(kernel.friction_coefficient(self.plant, mode, float(v_rel)))

@@ -1,0 +1,114 @@
+"""Tidy tables: named columns of equal length, light enough for the base install."""
+
+import contextlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class Table(dict[str, NDArray[Any]]):
+    """Columns by name, each of shape (n,); ``metadata`` says where they come from."""
+
+    def __init__(self, columns: Mapping[str, ArrayLike], metadata: Mapping[str, Any] | None = None) -> None:
+        super().__init__({name: np.asarray(values) for name, values in columns.items()})
+        self.metadata = dict(metadata or {})
+        lengths = {name: len(values) for name, values in self.items()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"columns must have one length, got {lengths}")
+
+    @property
+    def n_rows(self) -> int:
+        """The number of rows."""
+        return len(next(iter(self.values()))) if self else 0
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield each row as a dictionary of plain Python values."""
+        columns = {name: values.tolist() for name, values in self.items()}
+        for i in range(self.n_rows):
+            yield {name: values[i] for name, values in columns.items()}
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame.
+
+        Raises:
+            ImportError: if pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError as error:
+            raise ImportError('a DataFrame needs pandas: pip install "sd-friction-env[plot]"') from error
+        return pd.DataFrame(dict(self))
+
+    def to_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write the table, whole or not at all: comment lines "# key: value" with the metadata, a header, the rows.
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        with atomic_text(path) as file:
+            for key, value in self.metadata.items():
+                file.write(f"# {key}: {value if isinstance(value, str) else json.dumps(value)}\n")
+            file.write(",".join(self) + "\n")
+            for row in self.rows():
+                file.write(",".join(_cell(value) for value in row.values()) + "\n")
+
+    @classmethod
+    def from_csv(cls, path: str | os.PathLike[str]) -> "Table":
+        """Read what :meth:`to_csv` wrote; columns of numbers become float64.
+
+        Raises:
+            OSError: if the file cannot be read.
+            ValueError: if it is not such a table.
+        """
+        import csv
+
+        with open(path, encoding="utf-8", newline="") as file:
+            lines = file.read().splitlines()
+        metadata = {}
+        while lines and lines[0].startswith("# "):
+            key, _, value = lines.pop(0)[2:].partition(": ")
+            metadata[key] = value
+        cells = list(csv.reader(lines))
+        if not cells or any(len(row) != len(cells[0]) for row in cells):
+            raise ValueError(f"{os.fspath(path)!r} is not a table: a header and rows of one length are wanted")
+        columns: dict[str, ArrayLike] = {}
+        for name, *values in zip(*cells, strict=True):
+            try:
+                columns[name] = np.array([float(value) for value in values])
+            except ValueError:
+                columns[name] = np.array(values)
+        return cls(columns, metadata)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, str):
+        return '"' + value.replace('"', '""') + '"' if any(mark in value for mark in ',"\n') else value
+    return repr(value)
+
+
+@contextlib.contextmanager
+def atomic_text(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """Open a text file beside ``path`` and put it in its place only when all is written."""
+    target = Path(path)
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
+            yield file
+        os.chmod(name, 0o666 & ~_umask())
+        os.replace(name, target)
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(name)
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,211 @@
+"""The laws, the Runge-Kutta step, the automaton and the random numbers, against hand-computed values."""
+
+import hashlib
+import math
+import os
+import struct
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sd_friction_env import kernel
+from sd_friction_env.parameters import OscillatorParameters
+
+EXACT = OscillatorParameters().plant
+CUBIC = OscillatorParameters(geometry="cubic").plant
+LINEAR = OscillatorParameters(geometry="linear").plant
+PLANTS = {"exact": EXACT, "cubic": CUBIC, "linear": LINEAR}
+
+
+def test_spring_laws_agree_with_hand_computed_values():
+    # exact at x = .6, alpha = .8: the spring has its free length, so it pulls nowhere
+    assert kernel.spring(EXACT, 0.6) == pytest.approx((0.0, 1.0), abs=1e-16)
+    # exact at x = 1.5: length 1.7, R = 1.5 (.7/1.7), N = 1 - .8 (.7/1.7)
+    assert kernel.spring(EXACT, 1.5) == pytest.approx((1.05 / 1.7, 1.0 - 0.56 / 1.7), rel=1e-15)
+    # cubic at x = .8 = alpha: R = .8 - 1 + 1/2, N = 1 - .8 + 1 - 1/2
+    assert kernel.spring(CUBIC, 0.8) == pytest.approx((0.3, 0.7), rel=1e-15)
+    assert kernel.spring(LINEAR, -0.7) == (-0.7, 1.0)
+
+
+def test_friction_falls_from_mu_s_to_mu_m_at_v_m_and_rises_again():
+    assert kernel.friction_coefficient(EXACT, 1, 0.0) == 0.2
+    assert kernel.friction_coefficient(EXACT, -1, 0.0) == -0.2
+    assert kernel.friction_coefficient(EXACT, 1, 0.5) == pytest.approx(0.05, abs=1e-16)
+    assert kernel.friction_slope(EXACT, 1, 0.5) == pytest.approx(0.0, abs=1e-15)
+    # by hand: k1 = .45, k3 = .6, so mu(.2) = .2 - .09 + .0048
+    assert kernel.friction_coefficient(EXACT, 1, 0.2) == pytest.approx(0.1148, rel=1e-14)
+
+
+@pytest.mark.parametrize("geometry", PLANTS)
+@pytest.mark.parametrize("x", [-1.1, -0.3, 0.0, 0.45, 1.2])
+def test_slopes_and_potential_are_those_of_the_forces(geometry, x):
+    plant, h = PLANTS[geometry], 1e-5
+    above, below = kernel.spring(plant, x + h), kernel.spring(plant, x - h)
+    slopes = [(a - b) / (2.0 * h) for a, b in zip(above, below, strict=True)]
+    assert kernel.spring_slopes(plant, x) == pytest.approx(slopes, abs=1e-9)
+    force = (kernel.potential(plant, x + h) - kernel.potential(plant, x - h)) / (2.0 * h)
+    assert kernel.spring(plant, x)[0] == pytest.approx(force, abs=1e-9)
+
+
+def test_a_slip_step_is_of_eighth_order():
+    def end(steps, h):
+        x, v = 0.9, 0.1
+        for _ in range(steps):
+            x, v, *_ = kernel.slip_step(CUBIC, -1, x, v, 0.2, 0.0, 0.01, h)
+        return x, v
+
+    reference = end(128, 1.0 / 128)
+    errors = [abs(end(n, 1.0 / n)[0] - reference[0]) for n in (2, 4)]
+    assert 2.0**7 < errors[0] / errors[1] < 2.0**11
+
+
+def test_the_estimate_does_not_promise_more_than_a_step_keeps():
+    rng = np.random.default_rng(5)
+    for _ in range(300):
+        plant = OscillatorParameters(
+            geometry=("exact", "cubic", "linear")[rng.integers(3)],
+            alpha=rng.uniform(0.05, 1.5),
+            v_m=rng.uniform(0.2, 1),
+        ).plant
+        x, v, h = rng.uniform(-1, 1), rng.uniform(-0.6, 0.15), 0.125
+        while True:
+            x_end, v_end, _, _, estimate, _, _ = kernel.slip_step(plant, -1, x, v, 0.2, 0.0, 0.0, h)
+            if estimate <= kernel.TOLERANCE * h * max(1.0, abs(x), abs(v)):
+                break
+            h *= 0.5
+        fine = (x, v)
+        for _ in range(8):
+            fine = kernel.slip_step(plant, -1, *fine, 0.2, 0.0, 0.0, h / 8)[:2]
+        assert max(abs(x_end - fine[0]), abs(v_end - fine[1])) <= 1e-9 * h + 2e-15
+
+
+def test_a_stuck_mass_moves_with_an_accelerating_belt_exactly():
+    v_belt, a_belt, t = 0.2, -0.1, 0.1
+    x, v, belt, mode, status, *_ = kernel.advance(EXACT, 0.5, v_belt, v_belt, a_belt, 0.0, t, None)
+    assert (mode, status) == (kernel.STICK, kernel.OK)
+    assert v == belt == v_belt + a_belt * t
+    assert x == pytest.approx(0.5 + v_belt * t + 0.5 * a_belt * t * t, abs=2e-16)
+
+
+def test_a_hard_braked_belt_sheds_the_mass_forward():
+    # load = a_belt + 2 beta v_b + R(.6) = -1 + .02, beyond mu_s N = .2: the mass runs ahead
+    _, _, _, mode, *_ = kernel.advance(EXACT, 0.6, 0.2, 0.2, -1.0, 0.0, 0.01, None)
+    assert mode == kernel.SLIP_FORWARD
+    assert kernel.mode_at_zero_v_rel(EXACT, 0.6, 0.2, 1.0, 0.0) == kernel.SLIP_BACKWARD
+    assert kernel.mode_at_zero_v_rel(EXACT, 0.6, 0.2, 1.0, 1.0) == kernel.STICK
+
+
+def test_breakaway_on_the_linear_belt_is_at_mu_s_minus_2_beta_v_b():
+    events = np.empty((8, 4))
+    _, _, _, _, status, _, n, *_ = kernel.advance(LINEAR, 0.0, 0.2, 0.2, 0.0, 0.0, 1.0, events)
+    assert (status, n) == (kernel.OK, 1)
+    assert events[0].tolist() == pytest.approx([0.9, kernel.BREAKAWAY, 0.18, 0.2], abs=1e-13)
+
+
+def test_loss_of_contact_is_reported_where_the_normal_force_vanishes():
+    # cubic alpha = .2: N = 1.8 - x^2/.08 vanishes at x = sqrt(.144)
+    plant = OscillatorParameters(geometry="cubic", alpha=0.2).plant
+    x, _, _, _, status, t, *_ = kernel.advance(plant, 0.1, 3.0, 0.2, 0.0, 0.0, 1.0, None)
+    assert status == kernel.CONTACT_LOST
+    assert x == pytest.approx(math.sqrt(0.144), abs=1e-12)
+    assert 0.1 < t < 0.12  # 0.28 to go, a little slower than 3
+    start = kernel.advance(plant, 0.5, 0.0, 0.2, 0.0, 0.0, 1.0, None)
+    assert (start[4], start[5]) == (kernel.CONTACT_LOST, 0.0)
+
+
+def test_a_dip_to_the_surface_within_one_step_is_not_missed():
+    # On the linear belt a_rel = .18 - x at v_rel = 0: from a little before, v_rel rises by lead^2/.4 and falls again.
+    for lead in (0.003, 0.004, 0.008, 0.012):
+        events = np.empty((8, 4))
+        _, v, belt, _, _, _, n, *_ = kernel.advance(LINEAR, 0.18 - lead, 0.2 - 1e-5, 0.2, 0.0, 0.0, 0.1, events)
+        assert events[:n, 1].tolist() == [kernel.RESTICK, kernel.BREAKAWAY]
+        assert v < belt
+    *_, n, _, _, _, _, _ = kernel.advance(LINEAR, 0.18 - 0.001, 0.2 - 1e-5, 0.2, 0.0, 0.0, 0.1, None)
+    assert n == 0
+
+
+def test_no_event_is_invented_right_after_breakaway():
+    for fraction in (1e-12, 1e-9, 1e-6, 1e-3):
+        events = np.empty((64, 4))
+        _, v, belt, mode, status, _, n, *_ = kernel.advance(LINEAR, 0.18, 0.2, 0.2, 0.0, 0.0, fraction, events)
+        assert status == kernel.OK
+        assert n <= 1
+        assert v <= belt
+
+
+def test_integrals_over_an_interval_are_those_of_its_motion():
+    # stuck on a steady belt: v^2 = v_b^2, and the contact force does what spring and damper undo
+    *_, int_v2, stick_time, int_fv, x_min, x_max = kernel.advance(LINEAR, 0.0, 0.2, 0.2, 0.0, 0.05, 0.5, None)
+    assert int_v2 == pytest.approx(0.02, rel=1e-14)
+    assert stick_time == 0.5
+    assert int_fv == pytest.approx(-0.05 * 0.1 + 0.1 * 0.02 + 0.5 * 0.1**2, rel=1e-13)
+    assert (x_min, x_max) == pytest.approx((0.0, 0.1))
+
+
+def test_turning_points_inside_an_interval_are_found():
+    # almost free oscillation: x = cos t from (1, 0) has its minimum -1 at t = pi
+    plant = OscillatorParameters(geometry="linear", beta=0.0, mu_s=0.0, mu_m=0.0).plant
+    *_, x_min, x_max = kernel.advance(plant, 1.0, 0.0, 5.0, 0.0, 0.0, 4.0, None)
+    assert (x_min, x_max) == pytest.approx((-1.0, 1.0), abs=1e-10)
+
+
+def test_random_numbers_are_even_and_depend_on_every_word():
+    draws = np.array(
+        [kernel.random_uniform(2**61 + 7, e, s, k) for e in range(20) for s in range(100) for k in range(5)]
+    )
+    assert 0.0 <= draws.min() < draws.max() < 1.0
+    counts, _ = np.histogram(draws, bins=20, range=(0, 1))
+    chi_square = float(((counts - 500.0) ** 2 / 500.0).sum())
+    assert chi_square < 43.8  # 99.9th percentile of chi-square with 19 degrees of freedom
+    assert len(set(draws.tolist())) == draws.size
+    words = (5, 6, 7, 8)
+    base = kernel.random_uniform(*words)
+    for i in range(4):
+        assert kernel.random_uniform(*(w + (j == i) for j, w in enumerate(words))) != base
+    assert kernel.random_uniform(5 + 2**40, 6, 7, 8) != base
+    lagged = np.corrcoef(draws[:-1], draws[1:])[0, 1]
+    assert abs(lagged) < 0.035
+
+
+def test_normal_numbers_have_mean_zero_and_variance_one():
+    draws = np.array([kernel.random_normal(3, 1, step, 0) for step in range(20_000)])
+    assert abs(draws.mean()) < 0.025
+    assert abs(draws.var() - 1.0) < 0.04
+    assert abs((np.abs(draws) < 1.0).mean() - 0.6827) < 0.012
+
+
+SCENARIO = """
+import math, struct, sys
+from sd_friction_env import kernel
+from sd_friction_env.parameters import OscillatorParameters as P
+out = bytearray()
+for i, geometry in enumerate(("exact", "cubic", "linear")):
+    p = P(geometry=geometry, alpha=0.5 + 0.15 * i)
+    x, v, belt = 0.3, 0.2, 0.2
+    for n in range(150):
+        u = 0.05 * (2.0 * kernel.random_uniform(11, i, n, 0) - 1.0)
+        a = 0.4 * (2.0 * kernel.random_uniform(11, i, n, 1) - 1.0)
+        r = kernel.advance(p.plant, x, v, belt, a, u, 0.1, None)
+        x, v, belt = r[:3]
+        out += struct.pack("<7d", *r[:3], *r[7:10], r[11])
+    r = kernel.control_interval(*p.plant, 1, 0.5, 0.5, 0.2, 0.1, 0.1, 0.5, 0.4, 0.1, 0.21, -0.3)
+    out += struct.pack("<18d", *map(float, r))
+    out += struct.pack("<d", kernel.random_normal(1, 2, 3, 4))
+sys.stdout.write(out.hex())
+"""
+
+
+def test_interpreted_and_compiled_text_give_the_same_bits():
+    outputs = []
+    for disabled in ("0", "1"):
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
+        run = subprocess.run(
+            [sys.executable, "-c", SCENARIO], env=environment, capture_output=True, text=True, timeout=300, check=True
+        )
+        outputs.append(run.stdout)
+    assert len(outputs[0]) > 10_000
+    digests = [hashlib.sha256(text.encode()).hexdigest() for text in outputs]
+    assert digests[0] == digests[1]
+    assert all(math.isfinite(value) for (value,) in struct.iter_unpack("<d", bytes.fromhex(outputs[0])))

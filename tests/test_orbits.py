@@ -1,0 +1,184 @@
+"""Limit cycles and critical speeds: the reference numbers, closed forms and the laws they obey."""
+
+import math
+
+import pytest
+
+from sd_friction_env import OrbitError, OscillatorParameters, critical_belt_speeds, equilibria, limit_cycle, simulate
+
+NOMINAL = OscillatorParameters()
+CUBIC = OscillatorParameters(geometry="cubic")
+LINEAR = OscillatorParameters(geometry="linear")
+
+
+def test_nominal_cycle_has_the_reference_numbers():
+    cycle = limit_cycle(NOMINAL)
+    assert cycle.kind == "stick-slip"
+    assert cycle.x_breakaway == pytest.approx(0.9003939483, abs=6e-11)
+    assert cycle.x_restick == pytest.approx(0.4200879685, abs=6e-11)
+    assert cycle.period == pytest.approx(9.473197823, abs=6e-10)
+    assert cycle.amplitude == pytest.approx(0.393443261, abs=6e-10)
+    assert cycle.x_max == pytest.approx(1.117131185, abs=6e-10)
+    assert cycle.x_min == pytest.approx(0.330244663, abs=6e-10)
+    assert cycle.period * (1.0 - cycle.stick_fraction) == pytest.approx(7.071667923, abs=6e-10)
+    assert cycle.frequency * cycle.period == pytest.approx(1.0)
+    assert cycle.angular_frequency == pytest.approx(2.0 * math.pi / cycle.period)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "numbers"),
+    [
+        (NOMINAL.replace(belt_speed=0.05), {"period": 8.802095841, "amplitude": 0.102684647}),
+        (
+            CUBIC,
+            {
+                "x_breakaway": 0.6880088773,
+                "x_restick": 0.3775786358,
+                "period": 7.209157574,
+                "amplitude": 0.277193387,
+            },
+        ),
+        (LINEAR, {"x_breakaway": 0.18, "x_restick": -0.1459116890, "period": 6.799421444, "amplitude": 0.286208719}),
+    ],
+)
+def test_other_cycles_have_the_reference_numbers(parameters, numbers):
+    cycle = limit_cycle(parameters)
+    for name, value in numbers.items():
+        assert getattr(cycle, name) == pytest.approx(value, abs=6e-10), name
+
+
+@pytest.mark.parametrize(
+    ("belt_speed", "amplitude"),
+    [
+        (0.05, 0.08663),
+        (0.1, 0.16566),
+        (0.2, 0.28621),
+        (0.3, 0.35930),
+        (0.35, 0.38255),
+        (0.39, 0.39634),
+        (0.4, 0.37934),
+        (0.42, 0.27199),
+    ],
+)
+def test_linear_belt_has_the_reference_amplitudes(belt_speed, amplitude):
+    cycle = limit_cycle(LINEAR.replace(belt_speed=belt_speed))
+    assert cycle.amplitude == pytest.approx(amplitude, abs=6e-6)
+    assert cycle.kind == ("stick-slip" if belt_speed < 0.3958 else "pure-slip")
+
+
+def test_hopf_speeds_have_the_reference_numbers():
+    assert critical_belt_speeds(CUBIC)[1] == pytest.approx(0.4363322339, abs=6e-11)
+    assert critical_belt_speeds(NOMINAL)[1] == pytest.approx(0.4371980496, abs=6e-11)
+    # linear: v_b1 = v_m sqrt(1 - 4 beta v_m/(3 g1 (mu_s - mu_m)))
+    assert critical_belt_speeds(LINEAR)[1] == pytest.approx(0.5 * math.sqrt(1.0 - 0.1 / 0.45), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "v_b0", "v_b1"),
+    [(0.085, 0.0981, 0.1088), (0.12, 0.2658, 0.2929), (0.18, 0.3447, 0.3794), (0.25, 0.3834, 0.4200)],
+)
+def test_critical_speeds_of_the_papers_figure_5(ratio, v_b0, v_b1):
+    speeds = critical_belt_speeds(CUBIC.replace(mu_m=0.2 - 0.5 * ratio))
+    assert speeds.v_b1 == pytest.approx(v_b1, abs=6e-5)
+    # The reference for .085 is a little low (0.0981): see test_grazing in test_paper for the polished root.
+    assert speeds.v_b0 == pytest.approx(v_b0, abs=2e-4)
+    assert speeds.reason == ""
+
+
+@pytest.mark.parametrize("parameters", [NOMINAL, CUBIC, LINEAR, NOMINAL.replace(alpha=0.5), CUBIC.replace(g1=0.8)])
+def test_stick_slip_ends_at_v_b0_and_oscillation_at_v_b1(parameters):
+    v_b0, v_b1 = critical_belt_speeds(parameters)
+
+    def kind(belt_speed):
+        return limit_cycle(parameters.replace(belt_speed=belt_speed)).kind
+
+    assert kind(v_b0 - 1e-9) == "stick-slip"
+    assert kind(v_b0 + 1e-9) == "pure-slip"
+    assert kind(v_b1 - 1e-6) == "pure-slip"
+    assert kind(v_b1 + 1e-6) == "steady-slip"
+
+
+def test_amplitude_vanishes_at_v_b1_as_a_square_root():
+    v_b1 = critical_belt_speeds(LINEAR).v_b1
+    for lead in (1e-3, 1e-4, 1e-5):
+        v_b = v_b1 - lead
+        closed_form = 2.0 * math.sqrt(v_b1**2 - v_b**2)
+        assert limit_cycle(LINEAR.replace(belt_speed=v_b)).amplitude == pytest.approx(closed_form, rel=0.02)
+
+
+def test_nothing_oscillates_without_falling_friction_and_the_reason_says_so():
+    speeds = critical_belt_speeds(NOMINAL.replace(mu_m=0.2))
+    assert all(math.isnan(value) for value in speeds)
+    assert "nothing oscillates" in speeds.reason
+    v_b0, v_b1 = speeds
+    assert limit_cycle(NOMINAL.replace(mu_m=0.2)).kind == "steady-slip"
+
+
+def test_steady_slip_equilibria_have_the_reference_places():
+    assert equilibria(CUBIC)[-1].x == pytest.approx(0.64467779, abs=6e-9)
+    assert equilibria(NOMINAL)[-1].x == pytest.approx(0.81825172, abs=6e-9)
+    assert not equilibria(NOMINAL)[-1].stable
+    assert equilibria(NOMINAL.replace(belt_speed=0.45))[-1].stable
+
+
+def test_every_equilibrium_balances_and_both_wells_have_theirs():
+    p = NOMINAL.replace(alpha=0.2)
+    places = [e.x for e in equilibria(p)]
+    assert len(places) == 3
+    coefficient = -p.friction_coefficient(-p.belt_speed)
+    for x in places:
+        assert p.restoring_force(x) == pytest.approx(coefficient * p.normal_force(x), abs=1e-12)
+
+
+def test_two_wells_hold_two_attractors_and_the_start_decides():
+    p = NOMINAL.replace(alpha=0.2)
+    left, right = limit_cycle(p, -1.0, 0.0), limit_cycle(p, 1.0, 0.0)
+    assert left.x_max < 0.0 < right.x_min
+    assert (left.x_start, left.v_start) == (-1.0, 0.0)
+    # and the default start is a mass set down at x = 0 moving with the belt
+    default = limit_cycle(p)
+    assert (default.x_start, default.v_start) == (0.0, p.belt_speed)
+    assert default.amplitude == right.amplitude
+
+
+def test_belt_speed_zero_is_rest():
+    cycle = limit_cycle(NOMINAL.replace(belt_speed=0.0), 1.5, 0.0)
+    assert (cycle.kind, cycle.amplitude) == ("rest", 0.0)
+    assert abs(NOMINAL.restoring_force(cycle.x_max)) <= 0.2 * NOMINAL.normal_force(cycle.x_max)
+
+
+def test_a_cycle_is_what_a_long_simulation_settles_to():
+    for parameters in (NOMINAL, CUBIC.replace(belt_speed=0.41), NOMINAL.replace(alpha=0.5, belt_speed=0.3)):
+        cycle = limit_cycle(parameters)
+        history = simulate(parameters, t_end=600.0, dt=0.01)
+        assert history.amplitude(since=500.0) == pytest.approx(cycle.amplitude, rel=2e-5)
+
+
+def test_the_states_of_a_cycle_return_after_a_period():
+    for parameters in (NOMINAL, NOMINAL.replace(belt_speed=0.41)):
+        cycle = limit_cycle(parameters)
+        x, v = cycle.state(0.3)
+        later = simulate(parameters, x, v, cycle.period, dt=1.0)
+        assert (later.x[-1], later.v[-1]) == pytest.approx((x, v), abs=1e-9)
+
+
+def test_a_pure_slip_cycle_attracts_at_the_rate_of_its_floquet_multiplier():
+    parameters = NOMINAL.replace(belt_speed=0.42)
+    cycle = limit_cycle(parameters)
+    off = 1e-4
+    later = simulate(parameters, cycle.x_max + off, 0.0, cycle.period * 1.1, dt=1e-3)
+    peak = later.x[later.t > 0.9 * cycle.period].max()
+    assert (peak - cycle.x_max) / off == pytest.approx(cycle.floquet_multiplier, abs=2e-3)
+    assert 0.0 < cycle.floquet_multiplier < 1.0
+
+
+def test_an_orbit_that_loses_contact_is_an_error_that_says_where():
+    with pytest.raises(OrbitError, match=r"loses contact .* x = "):
+        limit_cycle(CUBIC.replace(alpha=0.1, belt_speed=0.39))
+
+
+def test_bad_starts_are_refused():
+    with pytest.raises(ValueError, match="x must be a finite number"):
+        limit_cycle(NOMINAL, math.inf)
+    with pytest.raises(TypeError, match="v must be a real number"):
+        limit_cycle(NOMINAL, 0.0, "fast")

@@ -1,0 +1,105 @@
+"""Figures drawn from tables and histories, readable in grey; needs matplotlib (extra "plot")."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sd_friction_env.simulation import Trajectory
+from sd_friction_env.tables import Table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours; lines differ in dash or weight too, so that grey prints tell them apart.
+BLUE, VERMILION, GREEN, GREY, BLACK = "#0072B2", "#D55E00", "#009E73", "#8A8A8A", "#202020"
+BRANCHES = {
+    "stick-slip": {"color": BLUE, "linestyle": "-", "linewidth": 2.2, "label": r"stick-slip, $A_0$"},
+    "pure-slip": {"color": VERMILION, "linestyle": (0, (4, 1.2)), "linewidth": 2.2, "label": r"pure slip, $A_1$"},
+    "steady-slip": {"color": GREY, "linestyle": ":", "linewidth": 1.8, "label": "steady slip"},
+}
+CONTROLLED = ({"marker": "o", "color": GREEN}, {"marker": "s", "color": VERMILION}, {"marker": "^", "color": BLACK})
+
+
+def new_figure(width: float, height: float, rows: int, columns: int, **arguments: Any) -> tuple["Figure", Any]:
+    """Return a figure (inches) and its axes, an array of shape (rows, columns), without touching a display.
+
+    Raises:
+        ImportError: if matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('figures need matplotlib: pip install "sd-friction-env[plot]"') from error
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, **arguments)
+    for axis in axes.flat:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(color="0.92", linewidth=0.8)
+        axis.set_axisbelow(True)
+    return figure, axes
+
+
+def save_figure(figure: "Figure", path: str | os.PathLike[str], dpi: int = 150) -> None:
+    """Write a figure, with nothing in the file that changes from run to run.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    figure.savefig(path, dpi=dpi, metadata={"Software": None} if str(path).endswith(".png") else None)
+
+
+def draw_amplitude_curve(axis: "Axes", curve: Table, column: str = "amplitude") -> None:
+    """Draw one curve over the belt speed, a line for each kind of motion."""
+    for kind, style in BRANCHES.items():
+        shown = np.where(curve["kind"] == kind, curve[column], np.nan)
+        if np.isfinite(shown).any():
+            axis.plot(curve["belt_speed"], shown, **style)  # type: ignore[arg-type]
+
+
+def mark_critical_speeds(axis: "Axes", v_b0: float, v_b1: float) -> None:
+    """Mark v_b0 and v_b1 with their values; the names stand to the left and right of the pair."""
+    marks = ((v_b0, "right", rf"$v_{{b0}} = {v_b0:.4f}$ "), (v_b1, "left", rf" $v_{{b1}} = {v_b1:.4f}$"))
+    for speed, side, label in marks:
+        if np.isfinite(speed):
+            axis.axvline(speed, color="0.45", linewidth=0.9, linestyle=(0, (6, 3)))
+            top = axis.get_ylim()[1]
+            axis.text(speed, 0.99 * top, label, rotation=90, va="top", ha=side, fontsize=8, color="0.3")
+
+
+def draw_controlled_points(axis: "Axes", series: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> None:
+    """Lay closed-loop amplitudes over a passive curve: (belt speeds, amplitudes) by name."""
+    for style, (name, (speeds, amplitudes)) in zip(CONTROLLED, series.items(), strict=False):
+        axis.plot(speeds, amplitudes, linestyle="none", markersize=5.5, markeredgecolor="white", label=name, **style)  # type: ignore[arg-type]
+
+
+def draw_before_and_after(histories: Mapping[str, Trajectory], switched_on: float, title: str) -> "Figure":
+    """Draw displacement, velocity and phase portrait of controlled histories, control starting at ``switched_on``.
+
+    Args:
+        histories: one row of panels each, by name. switched_on: time at which control begins. title: of the figure.
+    """
+    figure, axes = new_figure(11.0, 2.9 * len(histories), len(histories), 3, width_ratios=(2.2, 2.2, 1.6))
+    figure.suptitle(title)
+    for row, (name, history) in zip(axes, histories.items(), strict=True):
+        t, x, v, belt = history.t, history.x, history.v, history.v_belt
+        before = t <= switched_on
+        for axis, values, label in ((row[0], x, r"displacement $x$"), (row[1], v, r"velocity $\dot x$")):
+            axis.axvspan(switched_on, t[-1], color="0.95", zorder=0)
+            axis.plot(t[before], values[before], color=GREY, linewidth=1.4)
+            axis.plot(t[~before], values[~before], color=BLUE, linewidth=1.4)
+            axis.set_xlabel(r"time $\tau$")
+            axis.set_ylabel(label)
+            axis.margins(x=0)
+        row[0].set_title(name, loc="left", fontsize=10)
+        row[1].plot(t, belt, color=VERMILION, linewidth=1.0, linestyle=(0, (4, 2)), label=r"belt $v_b$")
+        row[1].legend(loc="lower right", fontsize=8, frameon=False)
+        row[2].plot(x[before], v[before], color=GREY, linewidth=1.2, label="passive")
+        row[2].plot(x[~before], v[~before], color=BLUE, linewidth=1.2, label="controlled")
+        row[2].plot(x[-1:], v[-1:], marker="o", color=BLACK, markersize=5, linestyle="none", label="end")
+        row[2].set_xlabel(r"$x$")
+        row[2].set_ylabel(r"$\dot x$")
+        row[2].legend(loc="lower left", fontsize=8, frameon=False)
+    return figure

@@ -43,7 +43,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  echo "      On Debian and Ubuntu: sudo apt install python3-venv" >&2; \
 	  exit 1; }
 	@"$(RUN)" $(PIP) --version >/dev/null 2>&1 || { \
-	  echo "Making $(VENV) ..."; "$(PYTHON)" -m venv --clear "$(VENV)"; }
+	  echo "Making $(VENV) ..."; "$(PYTHON)" -m venv "$(VENV)"; }
 	@"$(RUN)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "make: $(VENV) holds a Python older than 3.11. Remove it (make clean VENV=$(VENV)) and try again." >&2; \
 	  exit 1; }
@@ -81,7 +81,7 @@ constraints: ## renew constraints.txt from the newest versions (then run make te
 	.venv-newest/bin/python $(PIP) install $(TORCH_FROM) torch
 	.venv-newest/bin/python $(PIP) install -e ".[all,dev]"
 	sed -n '/^#/p' constraints.txt > constraints.new
-	.venv-newest/bin/python $(PIP) freeze --exclude-editable | sed 's/+.*//' >> constraints.new
+	.venv-newest/bin/python $(PIP) freeze --all --exclude-editable | sed -e '/^pip==/d' -e 's/+.*//' >> constraints.new
 	mv constraints.new constraints.txt
 	rm -rf .venv-newest
 

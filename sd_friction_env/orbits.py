@@ -150,6 +150,16 @@ def balance_points(parameters: OscillatorParameters, load: float, coefficient: f
     return sorted(points)
 
 
+def rest_place(parameters: OscillatorParameters) -> float:
+    """Return where the unloaded spring has its (right-hand) place of rest, R(x) = 0 with R'(x) > 0."""
+    alpha = parameters.alpha
+    if parameters.geometry == "exact" and alpha < 1.0:
+        return math.sqrt(1.0 - alpha * alpha)
+    if parameters.geometry == "cubic" and alpha < 1.0:
+        return alpha * math.sqrt(2.0 * (1.0 - alpha))
+    return 0.0
+
+
 def equilibria(parameters: OscillatorParameters) -> list[Equilibrium]:
     """Return the steady-slip equilibria (v_rel = -v_b), in ascending order of x, with contact and belt moving.
 

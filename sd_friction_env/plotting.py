@@ -20,6 +20,14 @@ BRANCHES = {
     "pure-slip": {"color": VERMILION, "linestyle": (0, (4, 1.2)), "linewidth": 2.2, "label": r"pure slip, $A_1$"},
     "steady-slip": {"color": GREY, "linestyle": ":", "linewidth": 1.8, "label": "steady slip"},
 }
+PAIR = ({"color": BLUE, "linewidth": 2.0}, {"color": VERMILION, "linewidth": 1.6, "linestyle": (0, (4, 1.2))})
+# A family of curves: colours of falling lightness, a marker each.
+FAMILY = (
+    {"color": "#56B4E9", "marker": "o"},
+    {"color": "#E69F00", "marker": "s"},
+    {"color": GREEN, "marker": "^"},
+    {"color": BLACK, "marker": "D"},
+)
 CONTROLLED = ({"marker": "o", "color": GREEN}, {"marker": "s", "color": VERMILION}, {"marker": "^", "color": BLACK})
 
 
@@ -57,6 +65,22 @@ def draw_amplitude_curve(axis: "Axes", curve: Table, column: str = "amplitude") 
         shown = np.where(curve["kind"] == kind, curve[column], np.nan)
         if np.isfinite(shown).any():
             axis.plot(curve["belt_speed"], shown, **style)  # type: ignore[arg-type]
+
+
+def draw_family_member(axis: "Axes", curve: Table, column: str, label: str, style: Mapping[str, str]) -> None:
+    """Draw one curve of several: solid in stick-slip, dashed in pure slip, with a few markers to tell it in grey."""
+    for kind, line in (("stick-slip", "-"), ("pure-slip", (0, (3, 1)))):
+        shown = np.where(curve["kind"] == kind, curve[column], np.nan)
+        every = {"markevery": (4, 16), "marker": style["marker"], "markersize": 4.5} if kind == "stick-slip" else {}
+        axis.plot(
+            curve["belt_speed"],
+            shown,
+            color=style["color"],
+            linestyle=line,  # type: ignore[arg-type]
+            linewidth=1.8,
+            label=label if kind == "stick-slip" else None,
+            **every,  # type: ignore[arg-type]
+        )
 
 
 def mark_critical_speeds(axis: "Axes", v_b0: float, v_b1: float) -> None:

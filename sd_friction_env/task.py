@@ -2,13 +2,12 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
 from sd_friction_env import kernel
-from sd_friction_env.orbits import LimitCycle, OrbitError, equilibria, limit_cycle
+from sd_friction_env.orbits import LimitCycle, OrbitError, equilibria, limit_cycle, rest_place
 from sd_friction_env.parameters import RANGES, STATE_LIMIT, OscillatorParameters, checked_choice, checked_number
 
 Actuator = Literal["force", "belt_speed"]
@@ -202,16 +201,6 @@ def passive_motion(parameters: OscillatorParameters) -> LimitCycle | None:
         return limit_cycle(parameters)
     except OrbitError:
         return None
-
-
-def rest_place(parameters: OscillatorParameters) -> float:
-    """Return where the unloaded spring has its (right-hand) place of rest, R(x) = 0 with R'(x) > 0."""
-    alpha = parameters.alpha
-    if parameters.geometry == "exact" and alpha < 1.0:
-        return math.sqrt(1.0 - alpha * alpha)
-    if parameters.geometry == "cubic" and alpha < 1.0:
-        return alpha * math.sqrt(2.0 * (1.0 - alpha))
-    return 0.0
 
 
 def rig_arguments(

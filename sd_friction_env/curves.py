@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env.orbits import OrbitError, limit_cycle
+from sd_friction_env.orbits import LimitCycle, OrbitError, attractors, equilibria, limit_cycle
 from sd_friction_env.parameters import RANGES, STATE_LIMIT, OscillatorParameters, checked_number
 from sd_friction_env.tables import Table
 
@@ -46,6 +46,13 @@ def checked_belt_speeds(belt_speeds: ArrayLike) -> NDArray[np.float64]:
     return speeds
 
 
+def _row(cycle: LimitCycle) -> dict[str, Any]:
+    """Return what a table says of a cycle and the start that reached it."""
+    row = {name: getattr(cycle, name) for name in _CYCLE_COLUMNS}
+    start = {"x_start": cycle.x_start, "v_start": cycle.v_start}
+    return {"belt_speed": cycle.parameters.belt_speed} | row | start | {"note": ""}
+
+
 def amplitude_curve(
     parameters: OscillatorParameters,
     belt_speeds: ArrayLike,
@@ -74,19 +81,66 @@ def amplitude_curve(
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
     if v is not None:
         v = checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
-    columns: dict[str, list[Any]] = {name: [] for name in ("belt_speed", *_CYCLE_COLUMNS, "x_start", "v_start", "note")}
+    rows = []
     for done, speed in enumerate(speeds.tolist(), start=1):
-        note = ""
-        row: dict[str, Any] = dict.fromkeys(_CYCLE_COLUMNS, float("nan"))
         try:
-            cycle = limit_cycle(parameters.replace(belt_speed=speed), x, v)
-            row = {name: getattr(cycle, name) for name in _CYCLE_COLUMNS}
+            rows.append(_row(limit_cycle(parameters.replace(belt_speed=speed), x, v)))
         except OrbitError as error:
-            row |= {"kind": "failed", "sticks": 0, "forward_arcs": 0}
-            note = str(error)
-        row |= {"belt_speed": speed, "x_start": x, "v_start": speed if v is None else v, "note": note}
-        for name, values in columns.items():
-            values.append(row[name])
+            rows.append(_failed_row(speed, x, speed if v is None else v, str(error)))
         if progress is not None:
             progress(done, len(speeds))
-    return Table(columns, {"parameters": dataclasses.asdict(parameters)})
+    return _table(rows, parameters)
+
+
+def attractor_curves(
+    parameters: OscillatorParameters,
+    belt_speeds: ArrayLike,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Table:
+    """Return all attractors at each belt speed, one row each; alpha < 1 has two wells and may have one in each.
+
+    Args:
+        parameters: of the oscillator; their belt speed is not used.
+        belt_speeds: of shape (n,), each in (0, 10].
+        progress: as in :func:`amplitude_curve`.
+
+    Returns:
+        The columns of :func:`amplitude_curve` and ``well``: "left" or "right" of the middle equilibrium, "only" where
+        there is one equilibrium, "both" for a motion round all of them. A belt speed without an attractor that keeps
+        contact is one row of kind "failed".
+
+    Raises:
+        TypeError, ValueError: if an argument is not as said.
+    """
+    speeds = checked_belt_speeds(belt_speeds)
+    rows = []
+    for done, speed in enumerate(speeds.tolist(), start=1):
+        plant = parameters.replace(belt_speed=speed)
+        found = attractors(plant)
+        places = [e.x for e in equilibria(plant)]
+        rows += [_row(cycle) | {"well": _well(cycle, places)} for cycle in found]
+        if not found:
+            rows.append(_failed_row(speed, float("nan"), float("nan"), "no attractor keeps contact") | {"well": ""})
+        if progress is not None:
+            progress(done, len(speeds))
+    return _table(rows, parameters)
+
+
+def _well(cycle: LimitCycle, places: list[float]) -> str:
+    if len(places) < 3:
+        return "only"
+    middle = places[1]
+    return "left" if cycle.x_max < middle else "right" if cycle.x_min > middle else "both"
+
+
+def _failed_row(belt_speed: float, x: float, v: float, note: str) -> dict[str, Any]:
+    row: dict[str, Any] = dict.fromkeys(_CYCLE_COLUMNS, float("nan"))
+    row |= {"kind": "failed", "sticks": 0, "forward_arcs": 0}
+    return row | {"belt_speed": belt_speed, "x_start": x, "v_start": v, "note": note}
+
+
+def _table(rows: list[dict[str, Any]], parameters: OscillatorParameters) -> Table:
+    names = ["belt_speed", *_CYCLE_COLUMNS, "x_start", "v_start", "note"]
+    names += [name for name in rows[0] if name not in names]
+    return Table({name: [row[name] for row in rows] for name in names}, {"parameters": dataclasses.asdict(parameters)})

@@ -94,6 +94,20 @@ def spring_slopes(plant, x):
 
 
 @compiled
+def spring_curvatures(plant, x):
+    """Return R''(x) and N''(x)."""
+    if plant.geometry == EXACT:
+        square = plant.alpha * plant.alpha
+        length = math.sqrt(x * x + square)
+        fifth = length * length * length * length * length
+        return 3.0 * square * x / fifth, plant.alpha * (2.0 * x * x - square) / fifth
+    if plant.geometry == CUBIC:
+        square = plant.alpha * plant.alpha
+        return 3.0 * x / (square * plant.alpha), -1.0 / square
+    return 0.0, 0.0
+
+
+@compiled
 def potential(plant, x):
     """Return V(x), the integral of R from 0 to x."""
     if plant.geometry == EXACT:
@@ -696,10 +710,13 @@ def trace(plant, x, v, v_belt, a_belt, u, times, samples, events):
 
 # Passive orbits: pieces of the analysis that run many times ---------------------------------------------------------
 
-REPEATED_BREAKAWAY, STILL_SLIPPING, AT_REST, ORBIT_LOST_CONTACT, ORBIT_UNDECIDED = 0, 1, 2, 3, 4
+REPEATED_BREAKAWAY, STILL_SLIPPING, AT_REST, ORBIT_LOST_CONTACT, ORBIT_UNDECIDED, AT_EQUILIBRIUM = 0, 1, 2, 3, 4, 5
 
 SAME_PLACE = 1e-9  # breakaway points closer than this are one
-LONG_TIME = 1e12
+STICK_PATIENCE = 1e12  # a belt this slow never brings a stuck mass to breakaway
+# Slip that takes longer from one turning point or landing to the next creeps into a node or past a fold.
+SLIP_PATIENCE = 2000.0
+STANDSTILL = 1e-9
 
 
 @compiled
@@ -720,7 +737,7 @@ def settle(plant, v_belt, x, v, turnings, exits):
         return ORBIT_LOST_CONTACT, x, math.nan, math.nan
     for _ in range(100 * turnings):
         if mode == STICK:
-            dt, event = stick_until_event(plant, x, v_belt, 0.0, 0.0, LONG_TIME)
+            dt, event = stick_until_event(plant, x, v_belt, 0.0, 0.0, STICK_PATIENCE)
             if event == NO_EVENT:
                 return AT_REST, x, math.nan, math.nan
             x = x + v_belt * dt
@@ -737,7 +754,7 @@ def settle(plant, v_belt, x, v, turnings, exits):
             maxima = 0
             last_max = math.nan
             continue
-        _, x, v, event, _, _, _, _ = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, LONG_TIME, True)
+        _, x, v, event, _, _, _, _ = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
         if event == LANDING:
             mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
         elif event == TURNING:
@@ -752,6 +769,8 @@ def settle(plant, v_belt, x, v, turnings, exits):
                 last_min = x
         elif event == CONTACT_LOSS:
             return ORBIT_LOST_CONTACT, x, math.nan, math.nan
+        elif event == NO_EVENT and abs(v) < STANDSTILL:
+            return AT_EQUILIBRIUM, x, math.nan, math.nan
         else:
             return ORBIT_UNDECIDED, x, math.nan, math.nan
     return ORBIT_UNDECIDED, x, math.nan, math.nan
@@ -778,7 +797,7 @@ def stick_slip_lap(plant, v_belt, x_exit):
     int_v2 = 0.0
     for _ in range(MAX_EVENTS):
         if mode == STICK:
-            dt, event = stick_until_event(plant, x, v_belt, 0.0, 0.0, LONG_TIME)
+            dt, event = stick_until_event(plant, x, v_belt, 0.0, 0.0, STICK_PATIENCE)
             t += dt
             stick_time += dt
             int_v2 += v_belt * v_belt * dt
@@ -793,7 +812,7 @@ def stick_slip_lap(plant, v_belt, x_exit):
                 forward_arcs += 1
             v = v_belt
             continue
-        dt, x, v, event, dv2, _, low, high = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, LONG_TIME, False)
+        dt, x, v, event, dv2, _, low, high = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, False)
         t += dt
         int_v2 += dv2
         x_min = min(x_min, low)
@@ -819,10 +838,12 @@ def next_maximum(plant, v_belt, x):
     acceleration, _ = slip_forces(plant, mode, x, 0.0, v_belt, 0.0)
     if mode != SLIP_BACKWARD or acceleration >= 0.0:
         return NO_EVENT, math.nan, math.nan, math.nan, math.nan
-    t, x_low, v, event, int_v2, _, _, _ = slip_until_event(plant, mode, x, 0.0, v_belt, 0.0, 0.0, LONG_TIME, True)
+    t, x_low, v, event, int_v2, _, _, _ = slip_until_event(plant, mode, x, 0.0, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
     if event != TURNING:
         return event, math.nan, x_low, t, int_v2
-    dt, x_high, v, event, dv2, _, _, _ = slip_until_event(plant, mode, x_low, 0.0, v_belt, 0.0, 0.0, LONG_TIME, True)
+    dt, x_high, v, event, dv2, _, _, _ = slip_until_event(
+        plant, mode, x_low, 0.0, v_belt, 0.0, 0.0, SLIP_PATIENCE, True
+    )
     return event, x_high, x_low, t + dt, int_v2 + dv2
 
 
@@ -834,7 +855,7 @@ def slip_returns_to_stick(plant, v_belt, x):
     mode = SLIP_BACKWARD if load > 0.0 else SLIP_FORWARD
     maxima = 0
     for _ in range(MAX_EVENTS):
-        _, x, v, event, _, _, _, _ = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, LONG_TIME, True)
+        _, x, v, event, _, _, _, _ = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
         if event == LANDING:
             mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
             if mode == STICK:
@@ -847,6 +868,62 @@ def slip_returns_to_stick(plant, v_belt, x):
         else:
             return False
     return False
+
+
+@compiled
+def classify(plant, v_belt, xs, vs, exits, exit_labels, centres, bounds, bound_labels, labels):
+    """Write the label of the attractor that each start (xs, vs) of shape (n,) reaches into ``labels``.
+
+    A start that sticks is carried to one of the ``exits`` and has its label. A start that slips round the equilibrium
+    ``centres[i]`` alone, from a maximum of x less than ``bounds[i, j]`` to its right, has ``bound_labels[i, j]`` for
+    the first such j (rows end with infinite bounds labelled below zero, "not decided yet"). -1: lost contact, -2: not
+    decided.
+    """
+    for n in range(len(xs)):
+        x = xs[n]
+        v = vs[n]
+        label = -2
+        mode = mode_of(plant, x, v, v_belt, 0.0, 0.0)
+        if spring(plant, x)[1] <= 0.0:
+            labels[n] = -1
+            continue
+        for _ in range(2000):
+            if mode == STICK:
+                dt, event = stick_until_event(plant, x, v_belt, 0.0, 0.0, STICK_PATIENCE)
+                x = x + v_belt * dt
+                best = 1e-6
+                for i in range(len(exits)):
+                    if abs(exits[i] - x) < best:
+                        best = abs(exits[i] - x)
+                        label = exit_labels[i]
+                break
+            _, x, v, event, _, _, _, _ = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
+            if event == LANDING:
+                mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
+            elif event == TURNING:
+                if mode == SLIP_BACKWARD and slip_forces(plant, mode, x, 0.0, v_belt, 0.0)[0] < 0.0:
+                    nearest = -1
+                    for i in range(len(centres)):
+                        if centres[i] < x:
+                            nearest = i
+                    if nearest >= 0:
+                        j = 0
+                        while x - centres[nearest] >= bounds[nearest, j]:
+                            j += 1
+                        if bound_labels[nearest, j] >= 0:
+                            label = bound_labels[nearest, j]
+                            break
+            elif event == NO_EVENT and abs(v) < STANDSTILL:
+                nearest = 0
+                for i in range(len(centres)):
+                    if abs(centres[i] - x) < abs(centres[nearest] - x):
+                        nearest = i
+                label = bound_labels[nearest, 0]
+                break
+            else:
+                label = -1 if event == CONTACT_LOSS else -2
+                break
+        labels[n] = label
 
 
 # One control interval -----------------------------------------------------------------------------------------------

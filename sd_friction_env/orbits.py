@@ -6,13 +6,14 @@ matters near the end of oscillation, where transients decay ever more slowly.
 """
 
 import cmath
+import contextlib
+import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 
 from sd_friction_env import kernel
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_number
@@ -20,8 +21,8 @@ from sd_friction_env.simulation import amplitude
 
 Kind = Literal["stick-slip", "pure-slip", "steady-slip", "rest"]
 
-_SETTLING_LAPS = 30
-_LONG_SETTLING_LAPS = 3000
+_SETTLING_LAPS = 8
+_LONG_SETTLING_LAPS = 800
 _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are called the equilibrium
 _EXITS = 64
 
@@ -210,6 +211,9 @@ def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | Non
             return _steady(parameters, "rest", place, x, v)
         if outcome == kernel.ORBIT_LOST_CONTACT:
             raise OrbitError(f"the mass loses contact with the belt at x = {place:.6g} (N <= 0); {parameters}")
+        if outcome == kernel.AT_EQUILIBRIUM:
+            nearest = min((e.x for e in equilibria(parameters)), key=lambda e: abs(e - place), default=place)
+            return _steady(parameters, "steady-slip", nearest, x, v)
         if outcome == kernel.ORBIT_UNDECIDED:
             break
         around = [e for e in equilibria(parameters) if lowest <= e.x <= place]
@@ -229,57 +233,159 @@ def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | Non
     raise OrbitError(f"the motion from x = {x!r}, v = {v!r} does not settle; {parameters}")
 
 
+class ReturnMap:
+    """The map from one maximum of x to the next in slip, by the radius: the distance of the maximum from a centre.
+
+    ``centre`` is the right-most equilibrium circled, ``innermost`` the left-most.
+    """
+
+    def __init__(self, parameters: OscillatorParameters, innermost: float, centre: float) -> None:
+        self.plant, self.speed = parameters.plant, parameters.belt_speed
+        self.innermost, self.centre = innermost, centre
+
+    def shift(self, radius: float) -> float:
+        """Return how much one lap adds to a radius; NaN if the lap sticks or does not circle just these equilibria."""
+        event, following, low, _, _ = kernel.next_maximum(self.plant, self.speed, self.centre + radius)
+        if event != kernel.TURNING or not low <= self.innermost:
+            return math.nan
+        return float(following - self.centre - radius)
+
+    def edge(self, inside: float, outside: float) -> float:
+        """Return the last radius with a lap, between one that has it and one that has not."""
+        while True:
+            middle = 0.5 * (inside + outside)
+            if middle in (inside, outside) or abs(outside - inside) < 1e-15:
+                return inside
+            if math.isnan(self.shift(middle)):
+                outside = middle
+            else:
+                inside = middle
+
+    def root(self, low: float, high: float) -> float:
+        """Return the radius of the cycle between two radii whose shifts differ in sign."""
+        return float(brentq(self.shift, low, high, xtol=1e-15, rtol=1e-14))
+
+    def cycles(self) -> tuple[list[float], float]:
+        """Return the radii of all cycles, ascending, and the largest radius with a lap.
+
+        The map is sampled on some hundred radii; where it comes near zero without crossing it, its extremum is looked
+        for, so that a pair of cycles about to merge is not stepped over.
+        """
+        top = 0.05
+        while top < 2.0 * STATE_LIMIT and not math.isnan(self.shift(top)):
+            top *= 1.5
+        grid = np.concatenate((np.geomspace(_SMALLEST_RADIUS, 0.01, 24), np.linspace(0.01, top, 80)[1:])).tolist()
+        laps = [(radius, self.shift(radius)) for radius in grid]
+        samples = [(radius, shift) for radius, shift in laps if not math.isnan(shift)]
+        if not samples:
+            return [], 0.0
+        beyond = [radius for radius, shift in laps if math.isnan(shift) and radius > samples[-1][0]]
+        if beyond:
+            last = self.edge(samples[-1][0], beyond[0])
+            samples.append((last, self.shift(last)))
+        radii = [self.root(r0, r1) for (r0, s0), (r1, s1) in itertools.pairwise(samples) if s0 * s1 < 0.0]
+        for (r0, s0), (_, s1), (r2, s2) in zip(samples, samples[1:], samples[2:], strict=False):
+            if s0 * s1 > 0.0 and s1 * s2 > 0.0 and abs(s1) < min(abs(s0), abs(s2)):
+                side = math.copysign(1.0, s1)
+                nearest = minimize_scalar(lambda r, side=side: side * self.shift(r), bounds=(r0, r2), method="bounded")
+                if nearest.fun < 0.0:
+                    radii += [self.root(r0, nearest.x), self.root(nearest.x, r2)]
+        return sorted(radii), samples[-1][0]
+
+
 def _limit_of_slip(
     parameters: OscillatorParameters, maximum: float, growing: bool, around: list[Equilibrium]
 ) -> tuple[str, float]:
     """Return where successive maxima of x tend from ``maximum``: ("pure-slip", fixed point), ("steady-slip", x) or
     ("on", a maximum on the way, beyond which the motion sticks or circles other equilibria)."""
-    plant, speed = parameters.plant, parameters.belt_speed
-    centre = around[-1].x
-
-    def shift(radius: float) -> float:
-        """How much one lap adds to the radius; NaN if the lap sticks or circles other equilibria."""
-        event, following, low, _, _ = kernel.next_maximum(plant, speed, centre + radius)
-        if event != kernel.TURNING or not low <= around[0].x:
-            return math.nan
-        return float(following - centre - radius)
-
+    laps = ReturnMap(parameters, around[0].x, around[-1].x)
+    centre = laps.centre
     radius = maximum - centre
     if growing:
         for _ in range(400):
             further = 1.1 * radius
-            change = shift(further)
+            change = laps.shift(further)
             if change < 0.0:
-                return "pure-slip", centre + _root(shift, radius, further)
+                return "pure-slip", centre + laps.root(radius, further)
             if math.isnan(change):
                 # Just inside of the largest orbit that does not stick there can still be a cycle.
-                inside, outside = radius, further
-                while outside - inside > 4.0 * math.ulp(outside):
-                    middle = 0.5 * (inside + outside)
-                    if math.isnan(shift(middle)):
-                        outside = middle
-                    else:
-                        inside = middle
-                    if middle in (inside, outside) and outside - inside <= 1e-15:
-                        break
-                if shift(inside) < 0.0:
-                    return "pure-slip", centre + _root(shift, radius, inside)
+                inside = laps.edge(radius, further)
+                if laps.shift(inside) < 0.0:
+                    return "pure-slip", centre + laps.root(radius, inside)
                 return "on", centre + further
             radius = further
         return "on", centre + radius
     while radius > _SMALLEST_RADIUS:
-        smaller = 0.7 * radius
-        change = shift(smaller)
+        smaller = 0.6 * radius
+        change = laps.shift(smaller)
         if change > 0.0:
-            return "pure-slip", centre + _root(shift, smaller, radius)
+            return "pure-slip", centre + laps.root(smaller, radius)
         if math.isnan(change):
             return "on", centre + smaller
         radius = smaller
     return "steady-slip", centre
 
 
-def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    return float(brentq(function, low, high, xtol=1e-15, rtol=1e-14))
+def slip_cycles(parameters: OscillatorParameters) -> list[LimitCycle]:
+    """Return every pure-slip cycle that circles one steady-slip equilibrium, stable (|multiplier| < 1) and unstable.
+
+    The start recorded with each is its own maximum of x.
+    """
+    found = []
+    for equilibrium in equilibria(parameters):
+        radii, _ = ReturnMap(parameters, equilibrium.x, equilibrium.x).cycles()
+        places = [equilibrium.x + radius for radius in radii]
+        found += [_pure_slip(parameters, place, place, 0.0) for place in places]
+    return found
+
+
+def stick_intervals(parameters: OscillatorParameters) -> list[tuple[float, float]]:
+    """Return the intervals of x in which a mass can stick, |2 beta v_b + R(x)| <= mu_s N(x), in ascending order."""
+    load = 2.0 * parameters.beta * parameters.belt_speed
+    ends = sorted(x for side in (-1.0, 1.0) for x in balance_points(parameters, load, side * parameters.mu_s))
+    intervals: list[tuple[float, float]] = []
+    for low, high in itertools.pairwise(ends):
+        force, limit = kernel.stick_load(parameters.plant, 0.5 * (low + high), parameters.belt_speed, 0.0, 0.0)
+        if abs(force) <= limit:
+            if intervals and intervals[-1][1] == low:
+                low = intervals.pop()[0]
+            intervals.append((low, high))
+    return intervals
+
+
+def attractors(parameters: OscillatorParameters) -> list[LimitCycle]:
+    """Return every attractor, each with a start that reaches it, in ascending order of the middle of its motion.
+
+    A mass that sticks leaves from the right end of a stick interval, so the stick-slip cycles are found by following
+    each of those ends once; what does not stick tends to a stable equilibrium or to a stable pure-slip cycle. (Cycles
+    of pure slip round several equilibria are found only if a stick interval's end leads there.)
+
+    Raises:
+        ValueError: if the belt stands still: then every place in a stick interval is one of rest.
+    """
+    if parameters.belt_speed == 0.0:
+        raise ValueError("belt_speed must be positive to list attractors, got 0.0: every stick interval is at rest")
+    found: list[LimitCycle] = []
+
+    def add(cycle: LimitCycle) -> None:
+        if not any(same_motion(cycle, other) for other in found):
+            found.append(cycle)
+
+    for _, right in stick_intervals(parameters):
+        with contextlib.suppress(OrbitError):
+            add(limit_cycle(parameters, right, parameters.belt_speed))
+    for equilibrium in equilibria(parameters):
+        if equilibrium.stable:
+            add(_steady(parameters, "steady-slip", equilibrium.x, equilibrium.x, 0.0))
+    for cycle in slip_cycles(parameters):
+        if abs(cycle.floquet_multiplier) < 1.0:
+            add(cycle)
+    return sorted(found, key=lambda cycle: cycle.x_max + cycle.x_min)
+
+
+def same_motion(a: LimitCycle, b: LimitCycle) -> bool:
+    """Whether two attractors of one oscillator are the same."""
+    return a.kind == b.kind and abs(a.x_max - b.x_max) < 1e-6 and abs(a.x_min - b.x_min) < 1e-6
 
 
 def _stick_slip(parameters: OscillatorParameters, x_exit: float, x: float, v: float) -> LimitCycle:
@@ -388,6 +494,33 @@ def hopf_belt_speed(parameters: OscillatorParameters) -> float:
             return float(brentq(damping, low, high, xtol=1e-14, rtol=1e-14)) if damping(high) > 0.0 else high
         high = float(low)
     return math.nan
+
+
+def first_lyapunov_coefficient(parameters: OscillatorParameters) -> float:
+    """Return the first Lyapunov coefficient of the Hopf point at v_b1, NaN if there is none.
+
+    Negative: supercritical, a stable cycle grows out of the equilibrium below v_b1. Positive: subcritical, an unstable
+    one shrinks onto it, and oscillation outlives v_b1. ``belt_speed`` is not used. Source: Guckenheimer and Holmes,
+    Nonlinear Oscillations, Eq. 3.4.11, for x'' = F(x, x').
+    """
+    speed = hopf_belt_speed(parameters)
+    if math.isnan(speed):
+        return math.nan
+    at_hopf = parameters.replace(belt_speed=speed)
+    plant, x = at_hopf.plant, equilibria(at_hopf)[-1].x
+    coefficient = float(kernel.friction_coefficient(plant, kernel.SLIP_BACKWARD, -speed))
+    slope = float(kernel.friction_slope(plant, kernel.SLIP_BACKWARD, -speed))
+    curvature, third = -6.0 * at_hopf.k3 * speed, 6.0 * at_hopf.k3
+    restoring_slope, normal_slope = kernel.spring_slopes(plant, x)
+    restoring_curvature, normal_curvature = kernel.spring_curvatures(plant, x)
+    normal = kernel.spring(plant, x)[1]
+    square = restoring_slope + coefficient * normal_slope  # omega^2
+    f_xx = -restoring_curvature - coefficient * normal_curvature
+    f_xv = -slope * normal_slope
+    f_vv = -curvature * normal
+    f_xxv = -slope * normal_curvature
+    f_vvv = -third * normal
+    return float((f_xxv + square * f_vvv + f_xv * f_xx / square + f_xv * f_vv) / 16.0)
 
 
 def grazing_belt_speed(parameters: OscillatorParameters) -> float:

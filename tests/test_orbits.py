@@ -176,6 +176,13 @@ def test_belt_speed_zero_is_rest():
     assert abs(NOMINAL.restoring_force(cycle.x_max)) <= 0.2 * NOMINAL.normal_force(cycle.x_max)
 
 
+def test_an_overdamped_mass_creeps_to_its_equilibrium_and_is_not_followed_for_ever():
+    p = NOMINAL.replace(beta=3.0, mu_m=0.2)
+    cycle = limit_cycle(p, 0.5, -1.0)
+    assert cycle.kind == "steady-slip"
+    assert cycle.x_max == pytest.approx(equilibria(p)[-1].x, abs=1e-12)
+
+
 def test_a_cycle_is_what_a_long_simulation_settles_to():
     for parameters in (NOMINAL, CUBIC.replace(belt_speed=0.41), NOMINAL.replace(alpha=0.5, belt_speed=0.3)):
         cycle = limit_cycle(parameters)

@@ -130,9 +130,8 @@ class OscillatorParameters:
         Raises:
             TypeError, ValueError: as the class does; M, K, L, g and V_m must be positive.
         """
-        positive = {"M": M, "K": K, "L": L, "g": g, "V_m": V_m}
-        for name, value in positive.items():
-            positive[name] = checked_number(name, value, math.ulp(0.0), 1e12)
+        for name, value in {"M": M, "K": K, "L": L, "g": g, "V_m": V_m}.items():
+            checked_number(name, value, math.ulp(0.0), 1e12)
         for name, value in {"C": C, "H": H, "V0": V0}.items():
             checked_number(name, value, 0.0, 1e12)
         omega0 = math.sqrt(K / M)

@@ -2,12 +2,15 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sd_friction_env.basins import Basins
 from sd_friction_env.simulation import Trajectory
-from sd_friction_env.tables import Table
+from sd_friction_env.tables import Table, atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,12 +54,15 @@ def new_figure(width: float, height: float, rows: int, columns: int, **arguments
 
 
 def save_figure(figure: "Figure", path: str | os.PathLike[str], dpi: int = 150) -> None:
-    """Write a figure, with nothing in the file that changes from run to run.
+    """Write a figure, whole or not at all, with nothing in the file that changes from run to run.
 
     Raises:
         OSError: if the file cannot be written.
     """
-    figure.savefig(path, dpi=dpi, metadata={"Software": None} if str(path).endswith(".png") else None)
+    path = Path(path)
+    stamp = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}.get(path.suffix)
+    with atomic_file(path, "wb") as file:
+        figure.savefig(file, format=path.suffix[1:], dpi=dpi, metadata={stamp: None} if stamp else None)
 
 
 def draw_amplitude_curve(axis: "Axes", curve: Table, column: str = "amplitude") -> None:
@@ -76,7 +82,7 @@ def draw_family_member(axis: "Axes", curve: Table, column: str, label: str, styl
             curve["belt_speed"],
             shown,
             color=style["color"],
-            linestyle=line,  # type: ignore[arg-type]
+            linestyle=line,
             linewidth=1.8,
             label=label if kind == "stick-slip" else None,
             **every,  # type: ignore[arg-type]
@@ -126,4 +132,94 @@ def draw_before_and_after(histories: Mapping[str, Trajectory], switched_on: floa
         row[2].set_xlabel(r"$x$")
         row[2].set_ylabel(r"$\dot x$")
         row[2].legend(loc="lower left", fontsize=8, frameon=False)
+    return figure
+
+
+def draw_amplitude_table(table: Table, members: Sequence[Mapping[str, Any]]) -> "Figure":
+    """Draw the curves of a sweep: one by its branches, several as a family, attractors as points.
+
+    Args:
+        table: as :func:`sd_friction_env.curves.amplitude_curve` makes it, with a column for each swept parameter.
+        members: the swept parameters of each curve, by name.
+    """
+    figure, axes = new_figure(6.4, 4.4, 1, 1)
+    axis = axes[0, 0]
+    for i, member in enumerate(members):
+        chosen = np.ones(table.n_rows, dtype=bool)
+        for name, value in member.items():
+            chosen &= table[name] == value
+        curve = Table({name: column[chosen] for name, column in table.items()})
+        label = ", ".join(f"{name} = {value}" for name, value in member.items())
+        if "well" in table:
+            for well, marker in (("left", "<"), ("right", ">"), ("only", "o"), ("both", "D")):
+                part = curve["well"] == well
+                if part.any():
+                    style = {"marker": marker, "markersize": 3.5, "linestyle": "none", "color": FAMILY[i % 4]["color"]}
+                    name = f"{label} {well} well" if well in ("left", "right") else label or "attractor"
+                    axis.plot(curve["belt_speed"][part], curve["amplitude"][part], label=name, **style)
+        elif len(members) == 1:
+            draw_amplitude_curve(axis, curve)
+        else:
+            draw_family_member(axis, curve, "amplitude", label, FAMILY[i % len(FAMILY)])
+    axis.set_xlabel(r"belt speed $v_b$")
+    axis.set_ylabel(r"amplitude $A$")
+    axis.set_ylim(bottom=0.0)
+    if len(members) <= 12:
+        axis.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def draw_history(history: Trajectory) -> "Figure":
+    """Draw displacement, velocity and phase portrait of one history, stick phases marked."""
+    figure, axes = new_figure(11.0, 3.2, 1, 3, width_ratios=(2.2, 2.2, 1.6))
+    stuck = history.mode == 0
+    for axis, values, label in ((axes[0, 0], history.x, "$x$"), (axes[0, 1], history.v, r"$\dot x$")):
+        axis.plot(history.t, values, color=BLUE, linewidth=1.4)
+        axis.plot(history.t, np.where(stuck, values, np.nan), color=VERMILION, linewidth=2.6, label="stick")
+        axis.set_xlabel(r"time $\tau$")
+        axis.set_ylabel(label)
+        axis.margins(x=0)
+    axes[0, 2].plot(history.x, history.v, color=BLUE, linewidth=1.2)
+    axes[0, 2].plot(np.where(stuck, history.x, np.nan), history.v, color=VERMILION, linewidth=2.6)
+    axes[0, 2].set_xlabel("$x$")
+    axes[0, 2].set_ylabel(r"$\dot x$")
+    axes[0, 0].legend(fontsize=8, frameon=False)
+    return figure
+
+
+def draw_basins(x: NDArray[np.float64], v: NDArray[np.float64], found: Basins) -> "Figure":
+    """Draw a grid of basins with the attractors on it.
+
+    Args:
+        x, v: axes of the grid, shapes (n,) and (m,). found: its basins, labels of shape (m, n).
+    """
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patches import Patch
+
+    shades = ["#F5F5F5", "#BBBBBB", "#A6CEE3", "#FDD9B5", "#B9E3C6", "#DDC7E8", "#F7EFA5"]
+    names = ["undecided", "contact lost", *(f"{cycle.kind}" for cycle in found.attractors)]
+    figure, axes = new_figure(6.8, 4.8, 1, 1)
+    axis = axes[0, 0]
+    axis.grid(visible=False)
+    colours = [shades[i % len(shades)] for i in range(len(names))]
+    norm = BoundaryNorm(np.arange(-2.5, len(found.attractors)), len(names))
+    axis.pcolormesh(x, v, found.labels, cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True)
+    lines = ("-", (0, (4, 1.5)), (0, (1, 1)), "-.")
+    for i, cycle in enumerate(found.attractors):
+        states = np.array([cycle.state(phase) for phase in np.linspace(0.0, 1.0, 400)])
+        axis.plot(*states.T, color=BLACK, linewidth=1.6, linestyle=lines[i % len(lines)])
+        if cycle.amplitude == 0.0:
+            axis.plot(*states[0], marker="o", color=BLACK)
+    axis.axhline(found.parameters.belt_speed, color="0.45", linewidth=0.8, linestyle=":")
+    axis.set_xlim(x[0], x[-1])
+    axis.set_ylim(v[0], v[-1])
+    axis.set_xlabel("start $x$")
+    axis.set_ylabel(r"start $\dot x$")
+    patches = []
+    for label in range(-2, len(found.attractors)):
+        share = found.fraction(label)[0]
+        if share > 0.0:
+            text = f"{names[label + 2]}, {100.0 * share:.1f}%"
+            patches.append(Patch(facecolor=colours[label + 2], edgecolor="0.6", label=text))
+    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=4, frameon=False)
     return figure

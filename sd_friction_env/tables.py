@@ -3,10 +3,9 @@
 import contextlib
 import json
 import os
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,12 +50,16 @@ class Table(dict[str, NDArray[Any]]):
         Raises:
             OSError: if the file cannot be written.
         """
-        with atomic_text(path) as file:
-            for key, value in self.metadata.items():
-                file.write(f"# {key}: {value if isinstance(value, str) else json.dumps(value)}\n")
-            file.write(",".join(self) + "\n")
-            for row in self.rows():
-                file.write(",".join(_cell(value) for value in row.values()) + "\n")
+        with atomic_file(path) as file:
+            self.write(file)
+
+    def write(self, file: IO[str]) -> None:
+        """Write what :meth:`to_csv` writes to an open text file."""
+        for key, value in self.metadata.items():
+            file.write(f"# {key}: {value if isinstance(value, str) else json.dumps(value)}\n")
+        file.write(",".join(self) + "\n")
+        for row in self.rows():
+            file.write(",".join(_cell(value) for value in row.values()) + "\n")
 
     @classmethod
     def from_csv(cls, path: str | os.PathLike[str]) -> "Table":
@@ -93,22 +96,20 @@ def _cell(value: Any) -> str:
 
 
 @contextlib.contextmanager
-def atomic_text(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Open a text file beside ``path`` and put it in its place only when all is written."""
+def atomic_file(path: str | os.PathLike[str], mode: str = "w") -> Iterator[Any]:
+    """Open a file beside ``path`` (mode "w" for text, "wb" for bytes) and put it in its place only when it is whole.
+
+    Raises:
+        OSError: if the folder cannot be written to.
+    """
     target = Path(path)
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    text = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
     try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
+        with open(partial, mode, **text) as file:  # type: ignore[call-overload]
             yield file
-        os.chmod(name, 0o666 & ~_umask())
-        os.replace(name, target)
+        os.replace(partial, target)
     except BaseException:
         with contextlib.suppress(FileNotFoundError):
-            os.unlink(name)
+            os.unlink(partial)
         raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

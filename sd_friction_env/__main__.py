@@ -1,0 +1,5 @@
+"""``python -m sd_friction_env`` is the program that is also installed as ``sd-friction``."""
+
+from sd_friction_env.cli import main
+
+raise SystemExit(main())

@@ -1,0 +1,410 @@
+"""The command line: passive analysis without writing code. ``python -m sd_friction_env --help`` lists the commands."""
+
+import argparse
+import dataclasses
+import itertools
+import json
+import math
+import re
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+import sd_friction_env
+from sd_friction_env import plotting
+from sd_friction_env.basins import LOST_CONTACT, UNDECIDED, basin_grid
+from sd_friction_env.curves import amplitude_curve, attractor_curves, checked_belt_speeds
+from sd_friction_env.orbits import OrbitError, critical_belt_speeds, first_lyapunov_coefficient, limit_cycle
+from sd_friction_env.parameters import GEOMETRIES, RANGES, OscillatorParameters
+from sd_friction_env.simulation import simulate
+from sd_friction_env.startup import announced
+from sd_friction_env.tables import Table, atomic_file
+
+FAILURE, BAD_USAGE, INTERRUPTED = 1, 2, 130
+
+_FIELDS = {
+    "alpha": "height of the spring's anchor over the belt, H/L",
+    "g1": "weight, g/(L omega0^2)",
+    "beta": "damping ratio",
+    "mu_s": "static friction coefficient",
+    "mu_m": "least kinetic friction coefficient",
+    "v_m": "relative speed of least friction",
+    "belt_speed": "belt speed v_b",
+}
+_MOST_POINTS = 10_000_000
+
+
+class UsageError(ValueError):
+    """An argument that makes no sense; the message says what would."""
+
+
+def numbers(text: str) -> list[float]:
+    """Return the values of one argument: a number, or start:stop:step with both ends included.
+
+    Raises:
+        argparse.ArgumentTypeError: if it is neither.
+    """
+    try:
+        parts = [float(part) for part in text.split(":")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number and no start:stop:step") from None
+    if len(parts) == 1:
+        return parts
+    if len(parts) != 3 or not all(math.isfinite(part) for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r} must be start:stop:step with three finite numbers")
+    start, stop, step = parts
+    if step <= 0.0 or stop < start:
+        raise argparse.ArgumentTypeError(f"{text!r} is empty: start:stop:step needs start <= stop and step > 0")
+    count = math.floor((stop - start) / step * (1.0 + 1e-12) + 1e-9) + 1
+    if count > _MOST_POINTS:
+        raise argparse.ArgumentTypeError(f"{text!r} holds {count} values; at most {_MOST_POINTS} are taken")
+    return [round(start + i * step, 12) for i in range(count)]
+
+
+class _Parser(argparse.ArgumentParser):
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        # What argparse takes for a value and not for an option: here ranges that begin below zero too.
+        self._negative_number_matcher = re.compile(r"^-[\d.]")
+
+    def error(self, message: str) -> NoReturn:
+        """Say in one line what is wrong and where to read more."""
+        print(f"{self.prog}: {message} (see {self.prog} --help)", file=sys.stderr)
+        raise SystemExit(BAD_USAGE)
+
+
+def _command(
+    commands: Any, name: str, run: Callable[[argparse.Namespace], int], summary: str, examples: Sequence[str]
+) -> argparse.ArgumentParser:
+    lines = "\n".join(f"  sd-friction {name} {example}" for example in examples)
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name,
+        help=summary,
+        description=f"{summary[0].upper()}{summary[1:]}.",
+        epilog=f"examples:\n{lines}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    group = parser.add_argument_group("oscillator", "one or more values each, or start:stop:step; several make a grid")
+    group.add_argument("--geometry", nargs="+", choices=GEOMETRIES, default=["exact"], help="forces (default: exact)")
+    nominal = OscillatorParameters()
+    for field, meaning in _FIELDS.items():
+        low, high = RANGES[field]
+        text = f"{meaning}, in [{low:g}, {high:g}] (default: {getattr(nominal, field):g})"
+        group.add_argument(
+            f"--{field.replace('_', '-')}", dest=field, nargs="+", type=numbers, metavar="VALUE", help=text
+        )
+    return parser
+
+
+def _add_start(parser: argparse.ArgumentParser) -> None:
+    text = "start (default: set down at x = 0 moving with the belt)"
+    parser.add_argument("--start", nargs=2, type=float, metavar=("X", "V"), help=text)
+
+
+def _add_output(parser: argparse.ArgumentParser, plot: str | None) -> None:
+    group = parser.add_argument_group("output")
+    group.add_argument("--out", type=Path, metavar="FILE", help="write to FILE.csv or FILE.json (default: print)")
+    group.add_argument("--json", action="store_true", help="print JSON instead of CSV")
+    if plot is not None:
+        group.add_argument("--plot", type=Path, metavar="FILE", help=f"draw {plot} into FILE.png, .svg or .pdf")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the whole program."""
+    program = _Parser(
+        prog="sd-friction",
+        description="Passive analysis of the self-excited SD oscillator on a moving belt.",
+        epilog="each command has its own help with examples: sd-friction amplitude --help",
+    )
+    program.add_argument("--version", action="version", version=f"sd_friction_env {sd_friction_env.__version__}")
+    commands = program.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+
+    command = _command(
+        commands,
+        "amplitude",
+        _amplitude,
+        "amplitude, period and kind of motion over the belt speed",
+        [
+            "--belt-speed 0:0.6:0.005",
+            "--alpha 0.2 0.5 0.7 0.8 --belt-speed 0:0.6:0.005 --geometry cubic --out curve.csv --plot curve.png",
+            "--alpha 0.5 --belt-speed 0.4:0.45:0.001 --attractors",
+        ],
+    )
+    _add_start(command)
+    command.add_argument("--attractors", action="store_true", help="all attractors of every point, whatever the start")
+    _add_output(command, "amplitude over the belt speed")
+
+    command = _command(
+        commands,
+        "cycle",
+        _cycle,
+        "the limit cycle that one start reaches",
+        ["", "--geometry cubic --belt-speed 0.405 --json", "--alpha 0.2 --start -1 0"],
+    )
+    _add_start(command)
+    _add_output(command, None)
+
+    command = _command(
+        commands,
+        "critical",
+        _critical,
+        "belt speeds at which stick-slip (v_b0) and oscillation (v_b1) end",
+        ["", "--geometry cubic exact linear --alpha 0.2:0.8:0.1", "--mu-m 0.1575 --json"],
+    )
+    _add_output(command, None)
+
+    command = _command(
+        commands,
+        "simulate",
+        _simulate,
+        "one history in time",
+        ["--t-end 60 --out history.csv --plot history.png", "--start 0.3 -0.4 --dt 0.1 --force 0.02"],
+    )
+    _add_start(command)
+    command.add_argument("--t-end", type=float, default=100.0, help="when to end (default: 100)")
+    command.add_argument("--dt", type=float, default=0.01, help="time between samples (default: 0.01)")
+    command.add_argument("--force", type=float, default=0.0, help="constant control force (default: 0)")
+    _add_output(command, "displacement, velocity and phase portrait")
+
+    command = _command(
+        commands,
+        "basins",
+        _basins,
+        "which attractor each start of a grid reaches",
+        ["--alpha 0.2 --plot basins.png", "--alpha 0.5 --belt-speed 0.43 --x -1.5 1.5 --v -1 1 --shape 800 800"],
+    )
+    command.add_argument("--x", nargs=2, type=float, default=[-1.5, 1.5], metavar=("LOW", "HIGH"), help="starts in x")
+    command.add_argument("--v", nargs=2, type=float, default=[-1.0, 1.0], metavar=("LOW", "HIGH"), help="starts in v")
+    command.add_argument("--shape", nargs=2, type=int, default=[400, 400], metavar=("N", "M"), help="grid (400 400)")
+    _add_output(command, "the basins")
+    return program
+
+
+def _grid(options: argparse.Namespace, *, belt_speed: bool = True) -> list[tuple[dict[str, Any], OscillatorParameters]]:
+    """Return what was swept, and the parameters, of each point of the grid; all are checked before any is computed."""
+    fields = [name for name in _FIELDS if belt_speed or name != "belt_speed"]
+    values: dict[str, list[Any]] = {"geometry": options.geometry}
+    for name in fields:
+        given = getattr(options, name)
+        if given is not None:
+            values[name] = list(itertools.chain.from_iterable(given))
+    count = math.prod(len(v) for v in values.values())
+    if count > _MOST_POINTS:
+        raise UsageError(f"the grid has {count} points; at most {_MOST_POINTS} are taken")
+    grid = []
+    for point in itertools.product(*values.values()):
+        named = dict(zip(values, point, strict=True))
+        swept = {name: value for name, value in named.items() if len(values[name]) > 1}
+        grid.append((swept, OscillatorParameters(**named)))
+    return grid
+
+
+def _one(options: argparse.Namespace) -> OscillatorParameters:
+    grid = _grid(options)
+    if len(grid) != 1:
+        raise UsageError(f"one oscillator is wanted, not a grid of {len(grid)}: give one value of each parameter")
+    return grid[0][1]
+
+
+def _start(options: argparse.Namespace) -> tuple[float, float | None]:
+    return (0.0, None) if options.start is None else (options.start[0], options.start[1])
+
+
+def _check_output(options: argparse.Namespace) -> None:
+    """Refuse names that could not be written at the end of a long computation."""
+    for name, endings in (("out", (".csv", ".json")), ("plot", (".png", ".svg", ".pdf"))):
+        path = getattr(options, name, None)
+        if path is None:
+            continue
+        if path.suffix not in endings:
+            raise UsageError(f"--{name} {str(path)!r} must end in {', '.join(endings)}")
+        if not path.parent.is_dir():
+            raise UsageError(f"--{name} {str(path)!r} lies in no existing folder: make {str(path.parent)!r} first")
+        if path.is_dir():
+            raise UsageError(f"--{name} {str(path)!r} is a folder")
+    if getattr(options, "plot", None) is not None:
+        plotting.new_figure(1.0, 1.0, 1, 1)  # says what to install if matplotlib is missing
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can say it: NaN and infinity become null."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _emit(options: argparse.Namespace, table: Table) -> None:
+    rows = [{name: _plain(value) for name, value in row.items()} for row in table.rows()]
+    document = json.dumps({"metadata": table.metadata, "rows": rows}, indent=1, allow_nan=False)
+    if options.out is None:
+        if options.json:
+            print(document)
+        else:
+            table.write(sys.stdout)
+    elif options.out.suffix == ".json":
+        with atomic_file(options.out) as file:
+            file.write(document + "\n")
+    else:
+        table.to_csv(options.out)
+
+
+def _metadata(options: argparse.Namespace) -> dict[str, Any]:
+    return {
+        "sd_friction_env": sd_friction_env.__version__,
+        "numpy": np.__version__,
+        "command": shlex.join(["sd-friction", *options.typed]),
+    }
+
+
+def _progress(total: int, unit: str) -> Callable[[int], None]:
+    """Return a function that shows how many of ``total`` are done, on a terminal and only if it takes a while."""
+    begun = shown = time.monotonic()
+
+    def show(done: int) -> None:
+        nonlocal shown
+        now = time.monotonic()
+        if sys.stderr.isatty() and now - begun > 1.0 and (now - shown > 0.2 or done == total):
+            shown = now
+            left = (now - begun) / done * (total - done)
+            bar = "#" * (30 * done // total)
+            print(f"\r[{bar:30}] {done}/{total} {unit}, {left:.0f} s left ", end="", file=sys.stderr, flush=True)
+            if done == total:
+                print(file=sys.stderr)
+
+    return show
+
+
+def _with_columns(table: Table, columns: dict[str, Any]) -> dict[str, Any]:
+    return {name: np.full(table.n_rows, value) for name, value in columns.items()} | dict(table)
+
+
+def _stack(tables: Iterator[dict[str, Any]], metadata: dict[str, Any]) -> Table:
+    parts = list(tables)
+    return Table({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, metadata)
+
+
+def _amplitude(options: argparse.Namespace) -> int:
+    grid = _grid(options, belt_speed=False)
+    given = options.belt_speed or [numbers("0:0.6:0.005")]
+    speeds = checked_belt_speeds(list(itertools.chain.from_iterable(given)))
+    x, v = _start(options)
+    if options.attractors and options.start is not None:
+        raise UsageError("--start and --attractors exclude each other: all attractors need no start")
+    show = _progress(len(grid) * len(speeds), "points")
+
+    def curves() -> Iterator[dict[str, Any]]:
+        for done, (swept, parameters) in enumerate(grid):
+
+            def progress(rows: int, total: int, before: int = done * len(speeds)) -> None:
+                show(before + rows)
+
+            if options.attractors:
+                curve = attractor_curves(parameters, speeds, progress=progress)
+            else:
+                curve = amplitude_curve(parameters, speeds, x=x, v=v, progress=progress)
+            yield _with_columns(curve, swept)
+
+    table = _stack(curves(), _metadata(options))
+    _emit(options, table)
+    if options.plot is not None:
+        plotting.save_figure(plotting.draw_amplitude_table(table, [swept for swept, _ in grid]), options.plot)
+    return 0
+
+
+def _cycle(options: argparse.Namespace) -> int:
+    grid = _grid(options)
+    x, v = _start(options)
+    show = _progress(len(grid), "cycles")
+    rows = []
+    for done, (swept, parameters) in enumerate(grid, start=1):
+        cycle = limit_cycle(parameters, x, v)
+        fields = [field.name for field in dataclasses.fields(cycle) if field.name != "parameters"]
+        rows.append(swept | {name: getattr(cycle, name) for name in fields})
+        show(done)
+    table = Table({name: [row[name] for row in rows] for name in rows[0]}, _metadata(options))
+    if len(rows) == 1 and options.out is None and not options.json:
+        for name, value in rows[0].items():
+            print(f"{name:22}{value if isinstance(value, str) else format(value, '.12g')}")
+    else:
+        _emit(options, table)
+    return 0
+
+
+def _critical(options: argparse.Namespace) -> int:
+    if options.belt_speed is not None:
+        raise UsageError("--belt-speed is what this command finds: leave it out")
+    grid = _grid(options, belt_speed=False)
+    show = _progress(len(grid), "oscillators")
+    rows: list[dict[str, Any]] = []
+    for done, (swept, parameters) in enumerate(grid, start=1):
+        speeds = critical_belt_speeds(parameters)
+        coefficient = first_lyapunov_coefficient(parameters)
+        hopf = "" if math.isnan(coefficient) else "supercritical" if coefficient < 0.0 else "subcritical"
+        numbers_ = {"v_b0": speeds.v_b0, "v_b1": speeds.v_b1, "first_lyapunov_coefficient": coefficient}
+        rows.append(swept | numbers_ | {"hopf": hopf, "reason": speeds.reason})
+        show(done)
+    _emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, _metadata(options)))
+    return 0
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    parameters = _one(options)
+    x, v = _start(options)
+    history = simulate(parameters, x, v, options.t_end, dt=options.dt, force=options.force)
+    table = history.to_table()
+    events = [list(event) for event in history.events]
+    table.metadata = _metadata(options) | {"status": history.status, "events": events}
+    _emit(options, table)
+    if options.plot is not None:
+        plotting.save_figure(plotting.draw_history(history), options.plot)
+    if history.status != "ok":
+        print(f"sd-friction simulate: {history.status} at t = {history.t[-1]:.6g}", file=sys.stderr)
+        return FAILURE
+    return 0
+
+
+def _basins(options: argparse.Namespace) -> int:
+    parameters = _one(options)
+    x, v, found = basin_grid(parameters, tuple(options.x), tuple(options.v), tuple(options.shape))
+    names = [f"{cycle.kind} round x = {0.5 * (cycle.x_max + cycle.x_min):.4f}" for cycle in found.attractors]
+    rows: list[dict[str, Any]] = []
+    for label, name in [*enumerate(names), (LOST_CONTACT, "contact lost"), (UNDECIDED, "undecided")]:
+        share, error = found.fraction(label)
+        size = found.attractors[label].amplitude if label >= 0 else math.nan
+        rows.append({"label": label, "attractor": name, "amplitude": size, "fraction": share, "standard_error": error})
+    _emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, _metadata(options)))
+    if options.plot is not None:
+        plotting.save_figure(plotting.draw_basins(x, v, found), options.plot)
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return the exit status: 0 done, 1 failed, 2 bad usage, 130 interrupted."""
+    typed = list(sys.argv[1:] if arguments is None else arguments)
+    options = parser().parse_args(typed)
+    options.typed = typed
+    try:
+        _check_output(options)
+        with announced("compiling the oscillator's kernel (once; the result is cached)"):
+            # Compiled here, so that progress bars time the work alone.
+            limit_cycle(OscillatorParameters())
+        return int(options.run(options))
+    except OrbitError as error:
+        print(f"sd-friction: {error}", file=sys.stderr)
+        return FAILURE
+    except (ValueError, TypeError, ImportError) as error:
+        print(f"sd-friction: {error}", file=sys.stderr)
+        return BAD_USAGE
+    except BrokenPipeError:  # the reader of our output has had enough
+        sys.stderr.close()
+        return 0
+    except OSError as error:
+        print(f"sd-friction: cannot write: {error}", file=sys.stderr)
+        return FAILURE
+    except KeyboardInterrupt:
+        print("\nsd-friction: interrupted, nothing written", file=sys.stderr)
+        return INTERRUPTED

@@ -123,7 +123,7 @@ def energy(report: Report) -> None:
 
 def against_oracle(report: Report, draws: int) -> None:
     """Random parameter sets and starts against SciPy's DOP853 with events, 50 time units of random held actions."""
-    from tests import oracle
+    import tests.oracle as oracle
 
     report.head(f"{draws} random oscillators, 50 time units, against SciPy DOP853 with events (rtol 1e-12)")
     rng = np.random.default_rng(2026)

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sd_friction_env import kernel
-from sd_friction_env.orbits import balance_points
+from sd_friction_env.orbits import stick_intervals
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_choice, checked_number
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.startup import announced
@@ -463,9 +463,8 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._renderer is None:
             self._renderer = Renderer(self.render_mode, fps=self.metadata["render_fps"])
         p, task = self._parameters, self.task
-        load = 2.0 * p.beta * self._v_belt
-        ends = [balance_points(p, load, sign * p.mu_s) for sign in (-1.0, 1.0)]
-        interval = (ends[0][-1], ends[1][-1]) if ends[0] and ends[1] else None
+        intervals = stick_intervals(p.replace(belt_speed=self._v_belt)) if self._v_belt >= 0.0 else []
+        interval = min(intervals, key=lambda ends: abs(0.5 * (ends[0] + ends[1]) - self._x), default=None)
         lows, highs, sticks = zip(*self._window, strict=True) if self._window else ((self._x,), (self._x,), (0.0,))
         by_belt = task.belt_authority * p.belt_speed if task.actuator == "belt_speed" else 0.0
         return self._renderer.draw(

@@ -49,8 +49,8 @@ class Task:
         episode_steps: control intervals after which an episode is truncated.
         w_effort, w_stick: weights of the squared action and of the share of time stuck, in [0, 1e6].
         start: "cycle" (a random phase of the passive limit cycle; where there is none, the equilibrium with ``kick``),
-            "rest" (at the unloaded spring's place of rest, v = 0) or "random" (x within 1.5 x_scale of x_offset, v
-            within v_scale of 0).
+            "rest" (at the unloaded spring's place of rest, v = 0) or "random" (x within 3 x_scale of x_offset, v
+            within 4 v_scale of 0).
         kick: velocity given to a mass that starts at its equilibrium.
         randomise: parameters drawn evenly from (low, high) at each reset, by name.
         show_parameters: whether the observation ends with the randomised parameters, each scaled to [-1, 1].
@@ -61,7 +61,7 @@ class Task:
             has seen counts if it is greater.
         observation_limit: observations are clipped to plus or minus this.
         x_offset, x_scale, v_scale: observations are (x - x_offset)/x_scale and v/v_scale. None: from the nominal
-            plant's passive motion (equilibrium, amplitude, twice the belt speed), never from an episode's own
+            plant's passive motion (equilibrium, half the amplitude, half the belt speed), never from an episode's own
             parameters, which would give them away.
 
     Raises:
@@ -134,12 +134,12 @@ class Task:
         place = 0.5 * (cycle.x_max + cycle.x_min) if cycle else 0.0
         if places:
             place = min((e.x for e in places), key=lambda x: abs(x - place))
-        size = cycle.amplitude if cycle and cycle.amplitude > 1e-3 else 0.5
+        size = 0.5 * cycle.amplitude if cycle and cycle.amplitude > 1e-3 else 0.25
         return dataclasses.replace(
             self,
             x_offset=place if self.x_offset is None else self.x_offset,
             x_scale=size if self.x_scale is None else self.x_scale,
-            v_scale=2.0 * nominal.belt_speed if self.v_scale is None else self.v_scale,
+            v_scale=0.5 * nominal.belt_speed if self.v_scale is None else self.v_scale,
         )
 
     def drawn_parameters(self, nominal: OscillatorParameters, key: int, episode: int) -> OscillatorParameters:
@@ -161,7 +161,7 @@ class Task:
             assert self.x_scale is not None
             assert self.v_scale is not None
             shares = [2.0 * kernel.random_uniform(key, episode, 0, slot) - 1.0 for slot in (_X_SLOT, _V_SLOT)]
-            return self.x_offset + 1.5 * self.x_scale * shares[0], self.v_scale * shares[1]
+            return self.x_offset + 3.0 * self.x_scale * shares[0], 4.0 * self.v_scale * shares[1]
         return self.cycle_state(parameters, kernel.random_uniform(key, episode, 0, _PHASE_SLOT))
 
     def cycle_state(self, parameters: OscillatorParameters, phase: float) -> tuple[float, float]:

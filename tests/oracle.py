@@ -1,0 +1,732 @@
+"""A slow and careful second opinion: the belt oscillator as a hybrid automaton on SciPy's DOP853.
+
+It shares no line with the package: forces, modes and events are written again here, in plain NumPy and SciPy, so that
+an error has to be made twice to go unseen. Any object with the attributes of `Plant` will do as `p`. Everything is
+dimensionless.
+
+In slip the sign of v_rel is frozen and each step's dense output is searched for events, also for a pair of crossings
+inside one step (SciPy's own event search looks at the ends of a step only, and so misses the shortest sticks). An event
+is then polished by integrating again from the last accepted step with Newton's correction: the dense output's error
+never reaches an event state. In stick x is a known parabola in time and breakaway the first root of the load against
+its limit.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from scipy.integrate import DOP853, solve_ivp
+from scipy.optimize import brentq, minimize_scalar
+
+SLIP_BACKWARD, STICK, SLIP_FORWARD = -1, 0, 1
+
+RTOL = 1e-12
+ATOL = 1e-14
+MAX_STEP = 0.1
+# Pieces searched in each step. Two crossings within one piece are found through the turn between them.
+SAMPLES = 4
+MAX_LEGS = 100_000
+
+
+class Parameters(Protocol):
+    """What the oracle reads of a parameter set."""
+
+    @property
+    def geometry(self) -> Any: ...
+    @property
+    def alpha(self) -> float: ...
+    @property
+    def g1(self) -> float: ...
+    @property
+    def beta(self) -> float: ...
+    @property
+    def mu_s(self) -> float: ...
+    @property
+    def mu_m(self) -> float: ...
+    @property
+    def v_m(self) -> float: ...
+    @property
+    def belt_speed(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class Plant:
+    """The oracle's own parameter set; the defaults are those of the paper's figures."""
+
+    geometry: str = "cubic"
+    alpha: float = 0.8
+    g1: float = 1.0
+    beta: float = 0.05
+    mu_s: float = 0.2
+    mu_m: float = 0.05
+    v_m: float = 0.5
+    belt_speed: float = 0.2
+
+
+class Event(NamedTuple):
+    """kind: "stick" (landing into stick), "cross" (straight on to the other slip side), "breakaway", "contact-loss"."""
+
+    time: float
+    kind: str
+    x: float
+    v: float
+
+
+@dataclass
+class Run:
+    """The end of a run and what was met on the way. Integrals are over the whole run."""
+
+    t: float
+    x: float
+    v: float
+    v_belt: float
+    mode: int
+    x_max: float
+    x_min: float
+    events: list[Event] = field(default_factory=list)
+    contact_lost: bool = False
+    v_squared: float = 0.0
+    time_stuck: float = 0.0
+    contact_work: float = 0.0
+    control_work: float = 0.0
+
+
+@dataclass
+class Leg:
+    """One stay in one mode, from one event or control instant to the next. `end` is "" where time ran out."""
+
+    mode: int
+    duration: float
+    x: float
+    v: float
+    v_belt: float
+    end: str
+    next_mode: int
+    x_max: float
+    x_min: float
+    v_squared: float
+    contact_work: float
+    maxima: list[float]
+
+
+@dataclass
+class Cycle:
+    """One period of the steady motion. `kind`: "stick-slip", "pure-slip", "steady-slip" or "rest".
+
+    x_breakaway is the breakaway that repeats and x_restick the landing after it; a cycle of several sticks lists all
+    of them in time order in `breakaways` and `resticks`. A stick forgets the past: its Floquet multiplier is 0.
+    """
+
+    kind: str
+    x_breakaway: float
+    x_restick: float
+    period: float
+    t_slip: float
+    stick_fraction: float
+    amplitude: float
+    x_max: float
+    x_min: float
+    sticks: int
+    floquet_multiplier: float
+    breakaways: list[float] = field(default_factory=list)
+    resticks: list[float] = field(default_factory=list)
+
+
+class Equilibrium(NamedTuple):
+    """Steady slip: trace and determinant of the Jacobian there (stable: trace < 0 < determinant)."""
+
+    x: float
+    trace: float
+    determinant: float
+
+
+def _check(p: Parameters) -> None:
+    if p.geometry not in ("exact", "cubic", "linear"):
+        raise ValueError(f"unknown geometry {p.geometry!r}")
+    if p.geometry != "linear" and p.alpha <= 0.0:
+        raise ValueError("the oracle has no second switching surface: alpha must be positive")
+
+
+def restoring(p: Parameters, x: Any) -> Any:
+    """R(x): Eq. 4 (exact), Eq. 9 (cubic), a straight line (linear)."""
+    if p.geometry == "exact":
+        return x - x / (x * x + p.alpha * p.alpha) ** 0.5
+    if p.geometry == "cubic":
+        return x - x / p.alpha + x**3 / (2.0 * p.alpha**3)
+    return 1.0 * x
+
+
+def restoring_slope(p: Parameters, x: Any) -> Any:
+    """R'(x)."""
+    if p.geometry == "exact":
+        return 1.0 - p.alpha**2 / (x * x + p.alpha * p.alpha) ** 1.5
+    if p.geometry == "cubic":
+        return 1.0 - 1.0 / p.alpha + 3.0 * x**2 / (2.0 * p.alpha**3)
+    return 0.0 * x + 1.0
+
+
+def potential(p: Parameters, x: Any) -> Any:
+    """V(x) with V' = R."""
+    if p.geometry == "exact":
+        return 0.5 * x * x - (x * x + p.alpha * p.alpha) ** 0.5
+    if p.geometry == "cubic":
+        return 0.5 * x * x * (1.0 - 1.0 / p.alpha) + x**4 / (8.0 * p.alpha**3)
+    return 0.5 * x * x
+
+
+def normal_force(p: Parameters, x: Any) -> Any:
+    """N(x): Eq. 4 (exact), Eq. 9 (cubic), g1 (linear)."""
+    if p.geometry == "exact":
+        return p.g1 - p.alpha + p.alpha / (x * x + p.alpha * p.alpha) ** 0.5
+    if p.geometry == "cubic":
+        return p.g1 - p.alpha + 1.0 - x**2 / (2.0 * p.alpha**2)
+    return 0.0 * x + p.g1
+
+
+def normal_force_slope(p: Parameters, x: Any) -> Any:
+    """N'(x)."""
+    if p.geometry == "exact":
+        return -p.alpha * x / (x * x + p.alpha * p.alpha) ** 1.5
+    if p.geometry == "cubic":
+        return -x / p.alpha**2
+    return 0.0 * x
+
+
+def _stribeck(p: Parameters) -> tuple[float, float]:
+    difference = p.mu_s - p.mu_m
+    return 1.5 * difference / p.v_m, 0.5 * difference / p.v_m**3
+
+
+def friction_coefficient(p: Parameters, w: Any, mode: int | None = None) -> Any:
+    """mu(v_rel), Eq. 5 with x' in its linear term; `mode` freezes the sign, as slip does."""
+    k1, k3 = _stribeck(p)
+    return p.mu_s * (np.sign(w) if mode is None else mode) - k1 * w + k3 * w**3
+
+
+def friction_slope(p: Parameters, w: Any) -> Any:
+    """d mu / d v_rel, away from v_rel = 0."""
+    k1, k3 = _stribeck(p)
+    return -k1 + 3.0 * k3 * w**2
+
+
+def stick_load(p: Parameters, x: Any, v_belt: Any, u: float = 0.0, a_belt: float = 0.0) -> Any:
+    """The contact force that holds the mass on the belt: a_belt + 2 beta v_belt + R - u."""
+    return a_belt + 2.0 * p.beta * v_belt + restoring(p, x) - u
+
+
+def _slip_flow(p: Parameters, mode: int, v_belt: float, u: float, a_belt: float) -> Callable[..., Any]:
+    """Right-hand side in slip: x, v, and the integrals of v^2 and of the contact force's power."""
+    k1, k3 = _stribeck(p)
+    static, damping = mode * p.mu_s, 2.0 * p.beta
+
+    def flow(t: float, y: Any) -> list[float]:
+        x, v = float(y[0]), float(y[1])
+        w = v - v_belt - a_belt * t
+        contact = -(static - k1 * w + k3 * w**3) * normal_force(p, x)
+        return [v, contact - damping * v - restoring(p, x) + u, v * v, contact * v]
+
+    return flow
+
+
+_TOLERANCES: dict[str, Any] = {"rtol": RTOL, "atol": np.array([ATOL, ATOL, 10 * ATOL, 10 * ATOL])}
+
+
+def _polish(
+    flow: Callable[..., Any],
+    surface: Callable[[float, Any], float],
+    surface_rate: Callable[[float, Any], float],
+    t_old: float,
+    y_old: np.ndarray,
+    t: float,
+) -> tuple[float, np.ndarray]:
+    """Time and state where `surface` is zero, near t, by integration from (t_old, y_old)."""
+    y = y_old
+    for _ in range(8):
+        if t <= t_old:
+            return t_old, y_old.copy()
+        y = solve_ivp(flow, (t_old, t), y_old, method="DOP853", first_step=t - t_old, **_TOLERANCES).y[:, -1]
+        rate = surface_rate(t, y)
+        if rate == 0.0:
+            break
+        correction = -surface(t, y) / rate
+        # A grazing root moves by the square root of rounding: a large correction there is noise.
+        if abs(correction) <= 2e-16 * max(1.0, t) or abs(correction) > 1e-3 * MAX_STEP:
+            break
+        t += correction
+        if abs(correction) < 1e-9:
+            # The remainder is of second order: one straight piece of flow is exact to rounding.
+            y = y + correction * np.array(flow(t, y))
+            break
+    return t, y
+
+
+def _slip(
+    p: Parameters,
+    mode: int,
+    x: float,
+    v: float,
+    v_belt: float,
+    u: float = 0.0,
+    a_belt: float = 0.0,
+    duration: float = math.inf,
+    stop_after_maxima: int | None = None,
+) -> Leg:
+    """Slip until v_rel returns to zero, contact is lost, time runs out, or (on request) x has peaked so many times."""
+    flow = _slip_flow(p, mode, v_belt, u, a_belt)
+
+    def gap(t: Any, y: Any) -> Any:
+        return mode * (y[1] - v_belt - a_belt * t)
+
+    def acceleration(t: Any, y: Any) -> Any:
+        w = y[1] - v_belt - a_belt * t
+        return -friction_coefficient(p, w, mode) * normal_force(p, y[0]) - 2.0 * p.beta * y[1] - restoring(p, y[0]) + u
+
+    def gap_rate(t: Any, y: Any) -> Any:
+        return mode * (acceleration(t, y) - a_belt)
+
+    def contact(t: Any, y: Any) -> Any:
+        return normal_force(p, y[0])
+
+    def contact_rate(t: Any, y: Any) -> Any:
+        return normal_force_slope(p, y[0]) * y[1]
+
+    def leg(t: float, y: Any, end: str, next_mode: int) -> Leg:
+        belt_now = v_belt + a_belt * t
+        # On the surface the two speeds are one number, else stick would creep by the rounding error.
+        v_now = belt_now if end in ("land", "cross") else float(y[1])
+        highs, lows = [x, float(y[0]), *maxima], [x, float(y[0]), *minima]
+        return Leg(
+            mode, float(t), float(y[0]), float(v_now), float(belt_now), end, next_mode, max(highs), min(lows),
+            float(y[2]), float(y[3]), maxima,
+        )  # fmt: skip
+
+    maxima: list[float] = []
+    minima: list[float] = []
+    y = np.array([x, v, 0.0, 0.0])
+    if duration <= 0.0:
+        return leg(0.0, y, "", mode)
+    solver = DOP853(flow, 0.0, y, duration, max_step=MAX_STEP, first_step=min(0.02, duration), **_TOLERANCES)
+    while solver.t < duration:
+        t_old, y_old = solver.t, solver.y.copy()
+        solver.step()
+        if solver.status == "failed":
+            raise RuntimeError(f"DOP853 stopped at {solver.t} with x={solver.y[0]}, v={solver.y[1]}")
+        dense = solver.dense_output()
+        ts = np.linspace(t_old, solver.t, SAMPLES + 1)
+        ys = dense(ts)
+        ys[:, 0], ys[:, -1] = y_old, solver.y
+        gaps, rates, contacts = gap(ts, ys), gap_rate(ts, ys), contact(ts, ys)
+        if t_old == 0.0 and v == v_belt:
+            gaps[0] = 0.0
+
+        for i in range(SAMPLES):
+            a, b = float(ts[i]), float(ts[i + 1])
+            landing = _first_root(dense, gap, gap_rate, a, b, gaps[i : i + 2], rates[i : i + 2])
+            turn = None
+            if ys[1, i] * ys[1, i + 1] < 0.0 or (ys[1, i + 1] == 0.0 and ys[1, i] != 0.0):
+                turn = _bracketed(dense, lambda t, y: y[1], a, b) if ys[1, i + 1] else b
+            loss = None
+            if contacts[i] > 0.0:
+                # N falls with |x|, so its least value in a piece lies at the piece's ends or where x turns.
+                for c in (turn, b):
+                    if loss is None and c is not None and contact(c, dense(c)) <= 0.0:
+                        loss = _bracketed(dense, contact, a, c)
+
+            first = min((s for s in (landing, loss) if s is not None), default=math.inf)
+            if turn is not None and turn < first:
+                t_turn, y_turn = _polish(flow, lambda t, y: y[1], acceleration, t_old, y_old, turn)
+                if acceleration(t_turn, y_turn) < 0.0:
+                    maxima.append(float(y_turn[0]))
+                    if len(maxima) == stop_after_maxima:
+                        return leg(t_turn, y_turn, "maximum", mode)
+                else:
+                    minima.append(float(y_turn[0]))
+            if landing is not None and first == landing:
+                t, y = _polish(flow, gap, gap_rate, t_old, y_old, landing)
+                belt_now = v_belt + a_belt * t
+                load, limit = stick_load(p, y[0], belt_now, u, a_belt), p.mu_s * normal_force(p, y[0])
+                if abs(load) <= limit:
+                    return leg(t, y, "land", STICK)
+                return leg(t, y, "cross", -int(np.sign(load)))
+            if loss is not None:
+                t, y = _polish(flow, contact, contact_rate, t_old, y_old, loss)
+                return leg(t, y, "contact-loss", mode)
+    return leg(solver.t, solver.y, "", mode)
+
+
+def _bracketed(dense: Callable[..., Any], surface: Callable[..., Any], a: float, b: float) -> float:
+    """The time in [a, b] at which `surface`, of opposite signs at the ends, is zero along the dense output."""
+    return float(brentq(lambda t: float(surface(t, dense(t))), a, b, xtol=1e-15))
+
+
+def _first_root(
+    dense: Callable[..., Any],
+    surface: Callable[..., Any],
+    surface_rate: Callable[..., Any],
+    a: float,
+    b: float,
+    values: np.ndarray,
+    rates: np.ndarray,
+) -> float | None:
+    """First time in [a, b] at which `surface`, positive on this side, comes down to zero; None where it does not."""
+
+    def at(t: float) -> float:
+        return float(surface(t, dense(t)))
+
+    if values[0] <= 0.0:
+        # A start on the surface, just after breakaway: not an event. It leaves, or it comes back within this piece.
+        if values[1] > 0.0:
+            return None
+        for k in range(1, 20):
+            inner = a + (b - a) * 0.5**k
+            if at(inner) > 0.0:
+                return _bracketed(dense, surface, inner, b)
+        return a
+    if values[1] <= 0.0:
+        return _bracketed(dense, surface, a, b)
+    if rates[0] < 0.0 < rates[1]:
+        bottom = _bracketed(dense, surface_rate, a, b)
+        if at(bottom) <= 0.0:
+            return _bracketed(dense, surface, a, bottom)
+    return None
+
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+
+
+def _stick(p: Parameters, x: float, v_belt: float, u: float = 0.0, a_belt: float = 0.0, duration: float = 1e4) -> Leg:
+    """Ride the belt: x = x0 + v_belt t + a_belt t^2/2 until the load first exceeds mu_s N, or time runs out."""
+
+    def position(t: Any) -> Any:
+        return x + v_belt * t + 0.5 * a_belt * t * t
+
+    def reserve(t: Any) -> Any:
+        at = position(t)
+        return p.mu_s * normal_force(p, at) - abs(stick_load(p, at, v_belt + a_belt * t, u, a_belt))
+
+    scale = 1.0 if p.geometry == "linear" else min(p.alpha, 1.0)
+    # The longest way the belt can go in this time, turning or not.
+    distance = abs(v_belt) * duration + 0.5 * abs(a_belt) * duration**2
+    ts = np.linspace(0.0, duration, 33 + math.ceil(distance / (0.005 * scale)))
+    reserves = reserve(ts)
+    out = np.flatnonzero(reserves[1:] < 0.0) + 1
+    last = int(out[0]) if len(out) else len(ts) - 1
+    bracket = (float(ts[last - 1]), float(ts[last])) if len(out) else None
+    # A dip between two samples that are both inside. (Samples past the first one outside no longer matter.)
+    for i in range(1, min(last + 1, len(ts) - 1)):
+        if reserves[i] <= reserves[i - 1] and reserves[i] < reserves[i + 1]:
+            rise = max(reserves[i - 1], reserves[i + 1]) - reserves[i]
+            if 0.0 <= reserves[i] <= rise:
+                bottom = minimize_scalar(
+                    reserve, bounds=(ts[i - 1], ts[i + 1]), method="bounded", options={"xatol": 1e-14}
+                )
+                if bottom.fun < 0.0:
+                    bracket = (float(ts[i - 1]), float(bottom.x))
+                    break
+    end, next_mode, t = "", STICK, duration
+    if bracket is not None:
+        # Landing on the cone's very edge: outside at once.
+        t = bracket[0] if reserve(bracket[0]) <= 0.0 else float(brentq(reserve, *bracket, xtol=1e-15))
+        end, next_mode = "breakaway", -int(np.sign(stick_load(p, position(t), v_belt + a_belt * t, u, a_belt)))
+
+    turning = [] if a_belt == 0.0 or not 0.0 < -v_belt / a_belt < t else [float(position(-v_belt / a_belt))]
+    places = [x, float(position(t)), *turning]
+    panels = 1 + math.ceil((abs(v_belt) * t + 0.5 * abs(a_belt) * t * t) / (0.1 * scale))
+    edges = np.linspace(0.0, t, panels + 1)
+    half = 0.5 * np.diff(edges)[:, None]
+    nodes = 0.5 * (edges[1:] + edges[:-1])[:, None] + half * _NODES
+    speeds = v_belt + a_belt * nodes
+    work = float(np.sum(half * _WEIGHTS * stick_load(p, position(nodes), speeds, u, a_belt) * speeds))
+    v_squared = v_belt * v_belt * t + v_belt * a_belt * t * t + a_belt * a_belt * t**3 / 3.0
+    v_now = v_belt + a_belt * t
+    x_now, x_max, x_min = float(position(t)), max(places), min(places)
+    return Leg(STICK, t, x_now, v_now, v_now, end, next_mode, x_max, x_min, v_squared, work, [])
+
+
+def _mode_at(p: Parameters, x: float, v: float, v_belt: float, u: float, a_belt: float) -> int:
+    if v != v_belt:
+        return SLIP_FORWARD if v > v_belt else SLIP_BACKWARD
+    load = stick_load(p, x, v_belt, u, a_belt)
+    return STICK if abs(load) <= p.mu_s * normal_force(p, x) else -int(np.sign(load))
+
+
+def _legs(
+    p: Parameters, mode: int, x: float, v: float, v_belt: float, u: float, a_belt: float, duration: float
+) -> Iterator[Leg]:
+    """The automaton over one control interval."""
+    left = duration
+    at_once = 0
+    while True:
+        leg = _stick(p, x, v_belt, u, a_belt, left) if mode == STICK else _slip(p, mode, x, v, v_belt, u, a_belt, left)
+        yield leg
+        left -= leg.duration
+        if leg.end in ("", "contact-loss") or left <= 0.0:
+            return
+        at_once = at_once + 1 if leg.duration < 1e-12 else 0
+        if at_once > 20:
+            raise RuntimeError(f"events follow each other without time passing at x={leg.x}, v={leg.v}")
+        x, v, v_belt, mode = leg.x, leg.v, leg.v_belt, leg.next_mode
+
+
+def run(
+    p: Parameters,
+    x: float,
+    v: float,
+    intervals: Iterable[tuple[float, float, float]],
+    v_belt: float | None = None,
+) -> Run:
+    """The oscillator over control intervals (duration, u, a_belt), from (x, v) on a belt at v_belt (default: p's).
+
+    A control instant re-evaluates the mode; a stuck mass that it sets free is a "breakaway" at that instant. The mode
+    that the very start finds is not an event. Loss of contact ends the run.
+    """
+    _check(p)
+    belt = float(p.belt_speed) if v_belt is None else float(v_belt)
+    state = Run(0.0, float(x), float(v), belt, STICK, float(x), float(x))
+    started = False
+    if normal_force(p, state.x) <= 0.0:
+        state.events.append(Event(0.0, "contact-loss", state.x, state.v))
+        state.contact_lost = True
+        state.mode = int(np.sign(state.v - belt))
+        return state
+    beginning = 0.0
+    for duration, u, a_belt in intervals:
+        mode = _mode_at(p, state.x, state.v, state.v_belt, u, a_belt)
+        if started and state.mode == STICK and mode != STICK:
+            state.events.append(Event(state.t, "breakaway", state.x, state.v))
+        started = True
+        state.mode = mode
+        for count, leg in enumerate(_legs(p, mode, state.x, state.v, state.v_belt, u, a_belt, duration)):
+            if count > MAX_LEGS:
+                raise RuntimeError(f"more than {MAX_LEGS} legs in one control interval")
+            state.t += leg.duration
+            state.control_work += u * (leg.x - state.x)
+            state.x, state.v, state.v_belt, state.mode = leg.x, leg.v, leg.v_belt, leg.next_mode
+            state.x_max, state.x_min = max(state.x_max, leg.x_max), min(state.x_min, leg.x_min)
+            state.v_squared += leg.v_squared
+            state.contact_work += leg.contact_work
+            state.time_stuck += leg.duration if leg.mode == STICK else 0.0
+            if leg.end:
+                kind = "stick" if leg.end == "land" else leg.end
+                state.events.append(Event(state.t, kind, leg.x, leg.v))
+            if leg.end == "contact-loss":
+                state.contact_lost = True
+                return state
+        beginning += duration
+        state.t = beginning
+    return state
+
+
+def cycle(
+    p: Parameters,
+    x0: float = 0.0,
+    v0: float | None = None,
+    max_time: float = 5000.0,
+    settle_maxima: int = 25,
+) -> Cycle:
+    """The steady motion reached from (x0, v0); the default start sets the mass down at x = 0 moving with the belt.
+
+    Stick-slip is settled once a breakaway repeats to 1e-11. A slip with `settle_maxima` peaks in a row and no stick is
+    taken for pure slip, and the fixed point of its return map at the peaks is sought from there.
+    """
+    _check(p)
+    belt = float(p.belt_speed)
+    x, v = float(x0), belt if v0 is None else float(v0)
+    mode = _mode_at(p, x, v, belt, 0.0, 0.0)
+    legs: list[Leg] = []
+    # Breakaways: their place, and how many legs lay before them.
+    breakaways: list[tuple[float, int]] = []
+    elapsed = 0.0
+    while elapsed < max_time:
+        if mode == STICK:
+            leg = _stick(p, x, belt, duration=max_time)
+            if leg.end == "":
+                return Cycle("rest", math.nan, math.nan, math.nan, 0.0, 1.0, 0.0, leg.x, leg.x, 0, 0.0)
+        else:
+            leg = _slip(p, mode, x, v, belt, duration=max_time, stop_after_maxima=settle_maxima)
+        legs.append(leg)
+        elapsed += leg.duration
+        x, v, mode = leg.x, leg.v, leg.next_mode
+        if leg.end == "contact-loss":
+            raise RuntimeError(f"contact lost at x={x}, v={v}")
+        if leg.end == "maximum":
+            pure = _pure_slip_cycle(p, leg.maxima[-3:])
+            if pure is not None:
+                return pure
+        if leg.end == "breakaway":
+            for place, count in breakaways:
+                if abs(place - x) < 1e-11:
+                    return _stick_slip_cycle(legs[count:])
+            breakaways.append((x, len(legs)))
+    raise RuntimeError(f"no periodic motion in {max_time} time units from x={x0}")
+
+
+def _stick_slip_cycle(legs: list[Leg]) -> Cycle:
+    period = sum(leg.duration for leg in legs)
+    t_slip = sum(leg.duration for leg in legs if leg.mode != STICK)
+    x_max, x_min = max(leg.x_max for leg in legs), min(leg.x_min for leg in legs)
+    resticks = [leg.x for leg in legs if leg.end == "land"]
+    ends = [leg.x for leg in legs if leg.end == "breakaway"]
+    # The legs start at a breakaway and end at the same one.
+    breakaways = [ends[-1], *ends[:-1]]
+    stuck = 1.0 - t_slip / period
+    half = 0.5 * (x_max - x_min)
+    return Cycle(
+        "stick-slip", breakaways[0], resticks[0], period, t_slip, stuck, half, x_max, x_min, len(resticks), 0.0,
+        breakaways, resticks,
+    )  # fmt: skip
+
+
+def _return(p: Parameters, x: float) -> Leg | None:
+    """From a peak (x, v = 0) to the next; None where the mass sticks on the way."""
+    # A start at the equilibrium itself never peaks.
+    leg = _slip(p, SLIP_BACKWARD, x, 0.0, float(p.belt_speed), duration=500.0, stop_after_maxima=1)
+    return leg if leg.end == "maximum" else None
+
+
+def _pure_slip_cycle(p: Parameters, peaks: list[float]) -> Cycle | None:
+    """The fixed point of the return map at the peaks of x, by Steffensen's iteration; None where there is none."""
+    x = peaks[-1]
+    for _ in range(60):
+        first = _return(p, x)
+        second = None if first is None else _return(p, first.x)
+        if first is None or second is None:
+            return None
+        if second.x_max - second.x_min < 1e-6:
+            return Cycle(
+                "steady-slip", math.nan, math.nan, math.nan, math.nan, 0.0, 0.0, second.x, second.x, 0, math.nan
+            )
+        one, two = first.x - x, second.x - first.x
+        if abs(one) < 1e-13 or two == one:
+            break
+        # Near a stable point the shift is one^2 / (one - two); a wild one is replaced by plain iteration.
+        shift = one * one / (one - two)
+        x = x + shift if abs(shift) < 0.2 and abs(two) < abs(one) else second.x
+        if abs(shift) < 1e-14:
+            break
+    leg = _return(p, x)
+    if leg is None or abs(leg.x - x) > 1e-11:
+        return None
+    amplitude = 0.5 * (x - leg.x_min)
+    # The slope of the return map, from both sides, or from inside where the outer orbits reach the belt's speed.
+    h = 1e-3 * amplitude
+    at = {k: _return(p, x + k * h) for k in (-3, -2, -1, 1, 2)}
+    after = {k: math.nan if side is None else side.x for k, side in at.items()}
+    if math.isnan(after[1] + after[2]):
+        multiplier = (11.0 * leg.x - 18.0 * after[-1] + 9.0 * after[-2] - 2.0 * after[-3]) / (6.0 * h)
+    else:
+        multiplier = (8.0 * (after[1] - after[-1]) - (after[2] - after[-2])) / (12.0 * h)
+    return Cycle(
+        "pure-slip", math.nan, math.nan, leg.duration, leg.duration, 0.0, amplitude, x, leg.x_min, 0, multiplier
+    )
+
+
+def equilibria(p: Parameters, reach: float = 4.0) -> list[Equilibrium]:
+    """Steady slip, from left to right: R(x) + mu(-v_belt) N(x) = 0 with N > 0 and a moving belt."""
+    _check(p)
+    w = -float(p.belt_speed)
+    mu, slope = float(friction_coefficient(p, w)), float(friction_slope(p, w))
+
+    def balance(x: Any) -> Any:
+        return restoring(p, x) + mu * normal_force(p, x)
+
+    # An odd count of points off a round step, so that none of them is an equilibrium by symmetry.
+    xs = np.linspace(-reach, 1.0001 * reach, 8001)
+    values = balance(xs)
+    found = []
+    for i in np.flatnonzero(values[:-1] * values[1:] < 0.0):
+        x = float(brentq(balance, xs[i], xs[i + 1], xtol=1e-15))
+        if normal_force(p, x) > 0.0:
+            trace = -2.0 * p.beta - slope * normal_force(p, x)
+            found.append(Equilibrium(x, float(trace), float(restoring_slope(p, x) + mu * normal_force_slope(p, x))))
+    return found
+
+
+def stick_intervals(p: Parameters, reach: float = 3.0) -> list[tuple[float, float, int]]:
+    """Where the belt can hold the mass, left to right: both ends, and the direction of breakaway at the right end."""
+    _check(p)
+    belt = float(p.belt_speed)
+
+    def reserve(x: Any) -> Any:
+        return p.mu_s * normal_force(p, x) - abs(stick_load(p, x, belt))
+
+    xs = np.linspace(-reach, 1.0001 * reach, 20001)
+    inside = reserve(xs) >= 0.0
+    ends = [float(brentq(reserve, xs[i], xs[i + 1], xtol=1e-15)) for i in np.flatnonzero(inside[:-1] != inside[1:])]
+    return [
+        (left, right, -int(np.sign(stick_load(p, right, belt))))
+        for left, right in zip(ends[::2], ends[1::2], strict=True)
+    ]
+
+
+def _at_speed(p: Parameters, belt_speed: float) -> Plant:
+    return Plant(p.geometry, p.alpha, p.g1, p.beta, p.mu_s, p.mu_m, p.v_m, belt_speed)
+
+
+def hopf(p: Parameters) -> float:
+    """v_b1, where the rightmost steady slip becomes stable: 2 beta + N(x_bar) mu'(-v_b1) = 0. NaN if it always is."""
+
+    def trace(v: float) -> float:
+        return equilibria(_at_speed(p, v))[-1].trace
+
+    low = 1e-6 * p.v_m
+    if p.beta == 0.0:
+        return p.v_m
+    return math.nan if trace(low) <= 0.0 else float(brentq(trace, low, p.v_m, xtol=1e-15))
+
+
+def _peak_after_breakaway(p: Parameters) -> float:
+    """The first peak of v_rel after the rightmost breakaway, with slip's sign frozen even past v_rel = 0."""
+    belt = float(p.belt_speed)
+    xs = np.linspace(-4.0, 4.0001, 8001)
+
+    def reserve(x: Any) -> Any:
+        return p.mu_s * normal_force(p, x) - stick_load(p, x, belt)
+
+    values = reserve(xs)
+    i = int(np.flatnonzero((values[:-1] > 0.0) & (values[1:] <= 0.0))[-1])
+    breakaway = float(brentq(reserve, xs[i], xs[i + 1], xtol=1e-15))
+    flow = _slip_flow(p, SLIP_BACKWARD, belt, 0.0, 0.0)
+
+    def acceleration(t: float, y: Any) -> float:
+        # At breakaway the acceleration is zero too, of either sign by rounding: that is no peak.
+        return flow(t, y)[1] if t > 0.05 else -1.0
+
+    acceleration.terminal = True  # type: ignore[attr-defined]
+    acceleration.direction = -1.0  # type: ignore[attr-defined]
+    solution = solve_ivp(
+        flow, (0.0, 200.0), [breakaway, belt, 0.0, 0.0], "DOP853", events=acceleration, max_step=0.05, **_TOLERANCES
+    )
+    assert solution.y_events is not None
+    return float(solution.y_events[0][0][1]) - belt
+
+
+def grazing(p: Parameters) -> float:
+    """v_b0, where the orbit from breakaway just fails to come back to the belt's speed: v_rel's first peak is zero."""
+    top = hopf(p)
+    return float(brentq(lambda v: _peak_after_breakaway(_at_speed(p, v)), 0.5 * top, top, xtol=1e-14))
+
+
+__all__ = [
+    "Cycle",
+    "Equilibrium",
+    "Event",
+    "Parameters",
+    "Plant",
+    "Run",
+    "cycle",
+    "equilibria",
+    "friction_coefficient",
+    "friction_slope",
+    "grazing",
+    "hopf",
+    "normal_force",
+    "potential",
+    "replace",
+    "restoring",
+    "run",
+    "stick_intervals",
+    "stick_load",
+]

@@ -18,6 +18,7 @@ from scipy.optimize import brentq, minimize_scalar
 from sd_friction_env import kernel
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_number
 from sd_friction_env.simulation import amplitude
+from sd_friction_env.theory import cubic_wells, exact_wells
 
 Kind = Literal["stick-slip", "pure-slip", "steady-slip", "rest"]
 
@@ -153,12 +154,8 @@ def balance_points(parameters: OscillatorParameters, load: float, coefficient: f
 
 def rest_place(parameters: OscillatorParameters) -> float:
     """Return where the unloaded spring has its (right-hand) place of rest, R(x) = 0 with R'(x) > 0."""
-    alpha = parameters.alpha
-    if parameters.geometry == "exact" and alpha < 1.0:
-        return math.sqrt(1.0 - alpha * alpha)
-    if parameters.geometry == "cubic" and alpha < 1.0:
-        return alpha * math.sqrt(2.0 * (1.0 - alpha))
-    return 0.0
+    wells = {"exact": exact_wells, "cubic": cubic_wells}.get(parameters.geometry)
+    return wells(parameters.alpha)[-1] if wells else 0.0
 
 
 def equilibria(parameters: OscillatorParameters) -> list[Equilibrium]:

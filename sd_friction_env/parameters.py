@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
 from sd_friction_env import kernel
+from sd_friction_env.theory import stribeck_coefficients
 
 Geometry = Literal["exact", "cubic", "linear"]
 
@@ -160,12 +161,12 @@ class OscillatorParameters:
     @property
     def k1(self) -> float:
         """Linear coefficient of the Stribeck law, 3/2 (mu_s - mu_m)/v_m (below Eq. 5)."""
-        return 1.5 * (self.mu_s - self.mu_m) / self.v_m
+        return stribeck_coefficients(self.mu_s, self.mu_m, self.v_m)[0]
 
     @property
     def k3(self) -> float:
         """Cubic coefficient of the Stribeck law, 1/2 (mu_s - mu_m)/v_m^3 (below Eq. 5)."""
-        return 0.5 * (self.mu_s - self.mu_m) / (self.v_m * self.v_m * self.v_m)
+        return stribeck_coefficients(self.mu_s, self.mu_m, self.v_m)[1]
 
     @property
     def plant(self) -> kernel.Plant:

@@ -4,9 +4,31 @@ Importing the package registers its environments with Gymnasium; everything else
 """
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register
+
+if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out for type checkers
+    from sd_friction_env.basins import Basins, basin_grid, basins
+    from sd_friction_env.curves import amplitude_curve, attractor_curves
+    from sd_friction_env.env import EnvState, SDFrictionEnv
+    from sd_friction_env.orbits import (
+        CriticalBeltSpeeds,
+        Equilibrium,
+        LimitCycle,
+        OrbitError,
+        attractors,
+        critical_belt_speeds,
+        equilibria,
+        first_lyapunov_coefficient,
+        limit_cycle,
+        slip_cycles,
+        stick_intervals,
+    )
+    from sd_friction_env.parameters import OscillatorParameters
+    from sd_friction_env.simulation import Trajectory, simulate
+    from sd_friction_env.tables import Table
+    from sd_friction_env.task import Task
 
 __version__ = "0.1.0"
 
@@ -14,6 +36,7 @@ _PUBLIC = {
     "OscillatorParameters": "parameters",
     "Trajectory": "simulation",
     "simulate": "simulation",
+    "CriticalBeltSpeeds": "orbits",
     "LimitCycle": "orbits",
     "Equilibrium": "orbits",
     "OrbitError": "orbits",
@@ -34,7 +57,33 @@ _PUBLIC = {
     "SDFrictionEnv": "env",
     "EnvState": "env",
 }
-__all__ = ["ENVIRONMENT_IDS", "__version__", *_PUBLIC]  # noqa: PLE0604 (the names are strings)
+__all__ = [
+    "ENVIRONMENT_IDS",
+    "Basins",
+    "CriticalBeltSpeeds",
+    "EnvState",
+    "Equilibrium",
+    "LimitCycle",
+    "OrbitError",
+    "OscillatorParameters",
+    "SDFrictionEnv",
+    "Table",
+    "Task",
+    "Trajectory",
+    "__version__",
+    "amplitude_curve",
+    "attractor_curves",
+    "attractors",
+    "basin_grid",
+    "basins",
+    "critical_belt_speeds",
+    "equilibria",
+    "first_lyapunov_coefficient",
+    "limit_cycle",
+    "simulate",
+    "slip_cycles",
+    "stick_intervals",
+]
 
 # Hidden parameters of the randomised tier, and the sensor of the sensed tier.
 _RANDOMISED: dict[str, Any] = {"randomise": {"belt_speed": (0.1, 0.35), "alpha": (0.6, 0.95), "mu_m": (0.03, 0.12)}}

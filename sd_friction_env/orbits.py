@@ -26,6 +26,7 @@ _SETTLING_LAPS = 8
 _LONG_SETTLING_LAPS = 800
 _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are called the equilibrium
 _EXITS = 64
+_BELT_SPEED_ERROR = 1e-13
 
 
 class OrbitError(ValueError):
@@ -129,25 +130,25 @@ def balance_points(parameters: OscillatorParameters, load: float, coefficient: f
         right = np.polymul([1.0, coefficient * alpha], [1.0, coefficient * alpha])
         polynomial = list(np.polysub(left, right))
     plant = parameters.plant
-
     points: list[float] = []
-    for root in np.roots(polynomial):
+    for root in np.roots(polynomial).tolist():
         if abs(root.imag) > 1e-6 * max(1.0, abs(root.real)):
             continue
-        x = float(root.real)
+        x = root.real
         for _ in range(8):
             restoring, normal = kernel.spring(plant, x)
+            error = load + restoring - coefficient * normal
             restoring_slope, normal_slope = kernel.spring_slopes(plant, x)
             slope = restoring_slope - coefficient * normal_slope
             if slope == 0.0:
                 break
-            x -= (load + restoring - coefficient * normal) / slope
-        restoring, normal = kernel.spring(plant, x)
-        error = abs(load + restoring - coefficient * normal)
-        size = 1.0 + abs(load) + abs(restoring) + abs(coefficient * normal)
+            x -= error / slope
+            if abs(error / slope) < 1e-15 * max(1.0, abs(x)):
+                break
         # Squaring and a wandering Newton iteration can both bring in roots that are none, or one twice.
+        size = 1.0 + abs(load) + abs(restoring) + abs(coefficient * normal)
         near = abs(x - root.real) < 1e-3 * max(1.0, abs(x))
-        if error < 1e-9 * size and near and all(abs(x - other) > 1e-9 for other in points):
+        if abs(error) < 1e-9 * size and near and all(abs(x - other) > 1e-9 for other in points):
             points.append(x)
     return sorted(points)
 
@@ -313,7 +314,7 @@ def _limit_of_slip(
             radius = further
         return "on", centre + radius
     while radius > _SMALLEST_RADIUS:
-        smaller = 0.6 * radius
+        smaller = 0.5 * radius
         change = laps.shift(smaller)
         if change > 0.0:
             return "pure-slip", centre + laps.root(smaller, radius)
@@ -534,12 +535,12 @@ def grazing_belt_speed(parameters: OscillatorParameters) -> float:
         return bool(kernel.slip_returns_to_stick(plant, speed, ends[-1]))
 
     high = 1.5 * parameters.v_m
-    for low in np.linspace(high, 0.0, 97)[1:-1]:
+    for low in np.linspace(high, 0.0, 49)[1:-1]:
         if sticks_again(float(low)):
             inside, outside = float(low), high
             while True:
                 middle = 0.5 * (inside + outside)
-                if not inside < middle < outside:
+                if outside - inside < _BELT_SPEED_ERROR:
                     return inside
                 if sticks_again(middle):
                     inside = middle

@@ -13,7 +13,7 @@ its limit.
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -524,12 +524,12 @@ def cycle(
     x0: float = 0.0,
     v0: float | None = None,
     max_time: float = 5000.0,
-    settle_maxima: int = 25,
+    settle_maxima: int = 12,
 ) -> Cycle:
     """The steady motion reached from (x0, v0); the default start sets the mass down at x = 0 moving with the belt.
 
     Stick-slip is settled once a breakaway repeats to 1e-11. A slip with `settle_maxima` peaks in a row and no stick is
-    taken for pure slip, and the fixed point of its return map at the peaks is sought from there.
+    taken for pure slip, and where its peaks tend to is sought from there as a root.
     """
     _check(p)
     belt = float(p.belt_speed)
@@ -545,14 +545,18 @@ def cycle(
             if leg.end == "":
                 return Cycle("rest", math.nan, math.nan, math.nan, 0.0, 1.0, 0.0, leg.x, leg.x, 0, 0.0)
         else:
-            leg = _slip(p, mode, x, v, belt, duration=max_time, stop_after_maxima=settle_maxima)
+            leg = _slip(p, mode, x, v, belt, duration=200.0, stop_after_maxima=settle_maxima)
         legs.append(leg)
         elapsed += leg.duration
         x, v, mode = leg.x, leg.v, leg.next_mode
         if leg.end == "contact-loss":
             raise RuntimeError(f"contact lost at x={x}, v={v}")
+        if leg.end in ("", "maximum") and abs(v) < 1e-7:
+            for equilibrium in equilibria(p):
+                if abs(x - equilibrium.x) < 1e-7 and equilibrium.trace < 0.0 < equilibrium.determinant:
+                    return _steady_slip(equilibrium.x)
         if leg.end == "maximum":
-            pure = _pure_slip_cycle(p, leg.maxima[-3:])
+            pure = _pure_slip_cycle(p, leg.maxima[-1])
             if pure is not None:
                 return pure
         if leg.end == "breakaway":
@@ -579,33 +583,49 @@ def _stick_slip_cycle(legs: list[Leg]) -> Cycle:
     )  # fmt: skip
 
 
+def _steady_slip(x: float) -> Cycle:
+    return Cycle("steady-slip", math.nan, math.nan, math.nan, math.nan, 0.0, 0.0, x, x, 0, math.nan)
+
+
 def _return(p: Parameters, x: float) -> Leg | None:
-    """From a peak (x, v = 0) to the next; None where the mass sticks on the way."""
-    # A start at the equilibrium itself never peaks.
-    leg = _slip(p, SLIP_BACKWARD, x, 0.0, float(p.belt_speed), duration=500.0, stop_after_maxima=1)
+    """From a peak (x, v = 0) to the next; None where the mass sticks on the way, or creeps into steady slip."""
+    leg = _slip(p, SLIP_BACKWARD, x, 0.0, float(p.belt_speed), duration=200.0, stop_after_maxima=1)
     return leg if leg.end == "maximum" else None
 
 
-def _pure_slip_cycle(p: Parameters, peaks: list[float]) -> Cycle | None:
-    """The fixed point of the return map at the peaks of x, by Steffensen's iteration; None where there is none."""
-    x = peaks[-1]
-    for _ in range(60):
-        first = _return(p, x)
-        second = None if first is None else _return(p, first.x)
-        if first is None or second is None:
-            return None
-        if second.x_max - second.x_min < 1e-6:
-            return Cycle(
-                "steady-slip", math.nan, math.nan, math.nan, math.nan, 0.0, 0.0, second.x, second.x, 0, math.nan
-            )
-        one, two = first.x - x, second.x - first.x
-        if abs(one) < 1e-13 or two == one:
-            break
-        # Near a stable point the shift is one^2 / (one - two); a wild one is replaced by plain iteration.
-        shift = one * one / (one - two)
-        x = x + shift if abs(shift) < 0.2 and abs(two) < abs(one) else second.x
-        if abs(shift) < 1e-14:
-            break
+def _pure_slip_cycle(p: Parameters, peak: float) -> Cycle | None:
+    """What pure slip through `peak` tends to: a cycle, steady slip, or None where it reaches the belt's speed.
+
+    Peaks move one way only (a return map of one variable keeps order), so the limit is the next zero of the map's
+    displacement that way. It is taken over the distance from the equilibrium, which is a zero that nobody asked for.
+    """
+    leg = _return(p, peak)
+    if leg is None:
+        return None
+    centre = max((e.x for e in equilibria(p) if leg.x_min < e.x < leg.x_max), default=math.nan)
+
+    def growth(x: float) -> float:
+        after = _return(p, x)
+        return math.nan if after is None else (after.x - x) / (x - centre)
+
+    x, here = peak, growth(peak)
+    if abs(here) > 1e-12:
+        factor = 1.3 if here > 0.0 else 1.0 / 1.3
+        while True:
+            beyond = centre + factor * (x - centre)
+            there = growth(beyond)
+            if not math.isfinite(there) and abs(factor - 1.0) > 1e-3:
+                # Sticking lies closer than this stride: shorter ones, in case the cycle is closer still.
+                factor = math.sqrt(factor)
+            elif not math.isfinite(there):
+                return None
+            elif abs(beyond - centre) < 1e-6:
+                return _steady_slip(centre)
+            elif here * there <= 0.0:
+                x = float(brentq(growth, x, beyond, xtol=1e-15))
+                break
+            else:
+                x, here = beyond, there
     leg = _return(p, x)
     if leg is None or abs(leg.x - x) > 1e-11:
         return None
@@ -724,7 +744,6 @@ __all__ = [
     "hopf",
     "normal_force",
     "potential",
-    "replace",
     "restoring",
     "run",
     "stick_intervals",

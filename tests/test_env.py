@@ -406,6 +406,16 @@ def test_frames_are_drawn_without_a_display():
     subprocess.run([sys.executable, "-W", "error", "-c", code], env=environment, check=True, timeout=120)
 
 
+def test_every_public_name_can_be_had():
+    import sd_friction_env
+
+    assert set(sd_friction_env._PUBLIC) | {"ENVIRONMENT_IDS", "__version__"} == set(sd_friction_env.__all__)
+    for name in sd_friction_env.__all__:
+        assert getattr(sd_friction_env, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = sd_friction_env.nothing
+
+
 def test_importing_the_package_loads_nothing_heavy():
     code = (
         "import sys, sd_friction_env\n"

@@ -161,7 +161,7 @@ def test_past_the_hopf_point_everything_settles_into_steady_slip():
     plant = Plant("cubic", belt_speed=0.45)
     end = oracle.cycle(plant)
     assert end.kind == "steady-slip"
-    assert end.x_max == pytest.approx(oracle.equilibria(plant)[0].x, abs=1e-6)
+    assert end.x_max == pytest.approx(oracle.equilibria(plant)[0].x, abs=1e-14)
 
 
 def test_near_the_hopf_point_the_floquet_multiplier_is_the_growth_rate_reversed():

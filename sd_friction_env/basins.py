@@ -1,7 +1,10 @@
 """Which attractor a start reaches: starts by the million, fractions of them, and grids to draw."""
 
 import dataclasses
+import itertools
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +24,8 @@ from sd_friction_env.orbits import (
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_number
 
 LOST_CONTACT, UNDECIDED = -1, -2
+
+_STARTS_WORTH_A_THREAD = 20_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,18 +93,26 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike) -> Basi
         for j, (bound, label) in enumerate(rows):
             bounds[i, j], bound_labels[i, j] = bound, label
     labels = np.empty(xs.size, dtype=np.int8)
-    kernel.classify(
-        parameters.plant,
-        parameters.belt_speed,
-        np.ascontiguousarray(xs).ravel(),
-        np.ascontiguousarray(vs).ravel(),
+    flat_x, flat_v = np.ascontiguousarray(xs).ravel(), np.ascontiguousarray(vs).ravel()
+    known = (
         np.array(exits),
         np.array(exit_labels, dtype=np.int64),
         np.array([place.x for place in places]),
         bounds,
         bound_labels,
-        labels,
     )
+
+    def classify(part: slice) -> None:
+        kernel.classify(parameters.plant, parameters.belt_speed, flat_x[part], flat_v[part], *known, labels[part])
+
+    # Starts do not know of each other: any number of threads gives the same labels. Few starts are not worth one.
+    threads = min(os.cpu_count() or 1, xs.size // _STARTS_WORTH_A_THREAD)
+    if threads < 2:
+        classify(slice(None))
+    else:
+        edges = np.linspace(0, xs.size, 8 * threads + 1).astype(int).tolist()
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(classify, itertools.starmap(slice, itertools.pairwise(edges))))
     return Basins(attractors=tuple(found), labels=labels.reshape(xs.shape), parameters=parameters)
 
 

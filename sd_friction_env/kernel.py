@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numba
 
-compiled = numba.njit(cache=True, error_model="numpy")
+compiled = numba.njit(cache=True, error_model="numpy", nogil=True)
 
 EXACT, CUBIC, LINEAR = 0, 1, 2
 

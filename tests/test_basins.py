@@ -83,6 +83,15 @@ def test_a_basin_label_is_the_attractor_that_following_the_start_finds(parameter
             assert same_motion(cycle, result.attractors[label])
 
 
+def test_threads_change_no_label(monkeypatch):
+    rng = np.random.default_rng(2)
+    x, v = rng.uniform(-1.5, 1.5, 2000), rng.uniform(-1.0, 1.0, 2000)
+    alone = basins(EXACT.replace(alpha=0.2), x, v).labels
+    monkeypatch.setattr("sd_friction_env.basins._STARTS_WORTH_A_THREAD", 100)
+    monkeypatch.setattr("os.cpu_count", lambda: 3)
+    assert np.array_equal(basins(EXACT.replace(alpha=0.2), x, v).labels, alone)
+
+
 def test_fractions_add_to_one_and_carry_their_uncertainty():
     _, _, result = basin_grid(EXACT.replace(alpha=0.2), (-1.5, 1.5), (-1.0, 1.0), (60, 50))
     assert result.labels.shape == (50, 60)

@@ -21,7 +21,7 @@ PIP := -m pip --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint format slow reference figures constraints clean
+.PHONY: help setup demo test lint format slow reference benchmark figures constraints clean
 
 help: ## list the targets
 	@echo "Usage: make TARGET [ARGS=...] [PYTHON=python3.12] [TORCH_INDEX=https://download.pytorch.org/whl/cpu]"
@@ -72,8 +72,11 @@ slow: setup ## run the tests that take minutes
 reference: setup ## print the numbers that the project promises, beside what it reaches
 	"$(RUN)" scripts/reference_numbers.py $(ARGS)
 
+benchmark: setup ## measure the speed, ours and others', in one run
+	"$(RUN)" scripts/benchmark.py $(ARGS)
+
 figures: setup ## compute and draw the paper's figures again
-	for number in 2 3 4 5; do "$(RUN)" scripts/figure_$$number.py || exit 1; done
+	for name in 2 3 4 5 basins linear; do "$(RUN)" scripts/figure_$$name.py || exit 1; done
 
 # The newest versions that the ranges in pyproject.toml allow, installed on their own and frozen.
 constraints: ## renew constraints.txt from the newest versions (then run make test)

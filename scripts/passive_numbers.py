@@ -145,12 +145,13 @@ def windows() -> None:
             parts = [before]
             for belt in np.arange(0.01, 0.601, 0.005).tolist():
                 now = left(belt)
-                if now != before:
+                while now != before:  # a step may hold more than one change
                     low, high = at, belt
                     while high - low > 1e-8:
                         middle = 0.5 * (low + high)
                         low, high = (middle, high) if left(middle) == before else (low, middle)
-                    parts.append(f"{high:.6f} {now}")
+                    before, at = left(high), high
+                    parts.append(f"{high:.6f} {before}")
                 before, at = now, belt
             print(f"    {geometry} {alpha}: {' | '.join(parts)}", flush=True)
 

@@ -378,7 +378,9 @@ def _basins(options: argparse.Namespace) -> int:
         rows.append({"label": label, "attractor": name, "amplitude": size, "fraction": share, "standard_error": error})
     _emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, _metadata(options)))
     if options.plot is not None:
-        plotting.save_figure(plotting.draw_basins(x, v, found), options.plot)
+        figure, axes = plotting.new_figure(6.8, 4.8, 1, 1)
+        plotting.draw_basins(axes[0, 0], x, v, found)
+        plotting.save_figure(figure, options.plot)
     return 0
 
 
@@ -389,7 +391,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.typed = typed
     try:
         _check_output(options)
-        with announced("compiling the oscillator's kernel (once; the result is cached)"):
+        with announced("orbits"):
             # Compiled here, so that progress bars time the work alone.
             limit_cycle(OscillatorParameters())
         return int(options.run(options))

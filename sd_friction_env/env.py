@@ -139,7 +139,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 _check_belt(self.nominal.replace(**{name: ends[corner] for name, ends in task.randomise.items()}))
         self.render_mode = render_mode
         self.reward = reward
-        with announced("compiling the oscillator's kernel (once; the result is cached)"):
+        with announced("orbits"):
             self.task = task.with_scales(self.nominal)
         self._full_state = task.sensor == "state"
         self._plain_sensor = self._full_state and task.sensor_noise == 0.0 and task.sensor_delay == 0
@@ -258,7 +258,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             _check_belt(parameters)
         if "start" in options:
             task = dataclasses.replace(task, start=options["start"])
-        with announced("compiling the oscillator's kernel (once; the result is cached)"):
+        with announced("starts"):
             if "x" in options:
                 x, v = options["x"], options.get("v", parameters.belt_speed)
             elif "phase" in options:

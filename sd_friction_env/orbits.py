@@ -222,7 +222,7 @@ def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | Non
             if abs(place - previous) < _SMALLEST_RADIUS:
                 return _steady(parameters, "steady-slip", place, x, v)
             continue
-        verdict, place = _limit_of_slip(parameters, place, place > previous, around)
+        verdict, place = _limit_of_slip(parameters, previous, place > previous, around)
         if verdict == "pure-slip":
             return _pure_slip(parameters, place, x, v)
         if verdict == "steady-slip":
@@ -294,34 +294,26 @@ class ReturnMap:
 def _limit_of_slip(
     parameters: OscillatorParameters, maximum: float, growing: bool, around: list[Equilibrium]
 ) -> tuple[str, float]:
-    """Return where successive maxima of x tend from ``maximum``: ("pure-slip", fixed point), ("steady-slip", x) or
-    ("on", a maximum on the way, beyond which the motion sticks or circles other equilibria)."""
+    """Return where successive maxima of x tend from ``maximum``, which has a next one: ("pure-slip", fixed point),
+    ("steady-slip", x) or ("on", the first maximum on the way from which the motion sticks or circles other equilibria).
+    """
     laps = ReturnMap(parameters, around[0].x, around[-1].x)
     centre = laps.centre
     radius = maximum - centre
-    if growing:
-        for _ in range(400):
-            further = 1.1 * radius
-            change = laps.shift(further)
-            if change < 0.0:
-                return "pure-slip", centre + laps.root(radius, further)
-            if math.isnan(change):
-                # Just inside of the largest orbit that does not stick there can still be a cycle.
-                inside = laps.edge(radius, further)
-                if laps.shift(inside) < 0.0:
-                    return "pure-slip", centre + laps.root(radius, inside)
-                return "on", centre + further
-            radius = further
-        return "on", centre + radius
-    while radius > _SMALLEST_RADIUS:
-        smaller = 0.5 * radius
-        change = laps.shift(smaller)
-        if change > 0.0:
-            return "pure-slip", centre + laps.root(smaller, radius)
+    factor = 1.1 if growing else 0.5
+    while _SMALLEST_RADIUS < radius < 2.0 * STATE_LIMIT:
+        following = factor * radius
+        change = laps.shift(following)
         if math.isnan(change):
-            return "on", centre + smaller
-        radius = smaller
-    return "steady-slip", centre
+            # Up to the last orbit with a lap there can still be a cycle; if there is none, the motion passes it.
+            following = laps.edge(radius, following)
+            change = laps.shift(following)
+            if (change > 0.0) == growing:
+                return "on", centre + following * (1.0 + (1e-12 if growing else -1e-12))
+        if (change > 0.0) != growing:
+            return "pure-slip", centre + laps.root(radius, following)
+        radius = following
+    return ("on", centre + radius) if growing else ("steady-slip", centre)
 
 
 def slip_cycles(parameters: OscillatorParameters) -> list[LimitCycle]:

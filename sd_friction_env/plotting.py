@@ -187,7 +187,7 @@ def draw_history(history: Trajectory) -> "Figure":
     return figure
 
 
-def draw_basins(x: NDArray[np.float64], v: NDArray[np.float64], found: Basins) -> "Figure":
+def draw_basins(axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], found: Basins) -> None:
     """Draw a grid of basins with the attractors on it.
 
     Args:
@@ -198,8 +198,6 @@ def draw_basins(x: NDArray[np.float64], v: NDArray[np.float64], found: Basins) -
 
     shades = ["#F5F5F5", "#BBBBBB", "#A6CEE3", "#FDD9B5", "#B9E3C6", "#DDC7E8", "#F7EFA5"]
     names = ["undecided", "contact lost", *(f"{cycle.kind}" for cycle in found.attractors)]
-    figure, axes = new_figure(6.8, 4.8, 1, 1)
-    axis = axes[0, 0]
     axis.grid(visible=False)
     colours = [shades[i % len(shades)] for i in range(len(names))]
     norm = BoundaryNorm(np.arange(-2.5, len(found.attractors)), len(names))
@@ -222,4 +220,3 @@ def draw_basins(x: NDArray[np.float64], v: NDArray[np.float64], found: Basins) -
             text = f"{names[label + 2]}, {100.0 * share:.1f}%"
             patches.append(Patch(facecolor=colours[label + 2], edgecolor="0.6", label=text))
     axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=4, frameon=False)
-    return figure

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from sd_friction_env import OrbitError, OscillatorParameters, critical_belt_speeds, equilibria, limit_cycle, simulate
-from sd_friction_env.orbits import balance_points
+from sd_friction_env.orbits import balance_points, rest_place
 
 NOMINAL = OscillatorParameters()
 CUBIC = OscillatorParameters(geometry="cubic")
@@ -174,6 +174,16 @@ def test_belt_speed_zero_is_rest():
     cycle = limit_cycle(NOMINAL.replace(belt_speed=0.0), 1.5, 0.0)
     assert (cycle.kind, cycle.amplitude) == ("rest", 0.0)
     assert abs(NOMINAL.restoring_force(cycle.x_max)) <= 0.2 * NOMINAL.normal_force(cycle.x_max)
+
+
+@pytest.mark.parametrize("belt_speed", [0.3986, 0.399, 0.4])
+def test_a_growing_slip_is_followed_no_further_out_than_it_goes(belt_speed):
+    # A little outside of this cycle the mass would lose contact; the motion itself keeps it.
+    parameters = CUBIC.replace(alpha=0.2, belt_speed=belt_speed)
+    cycle = limit_cycle(parameters, rest_place(parameters), 0.0)
+    history = simulate(parameters, rest_place(parameters), 0.0, 400.0, dt=0.005)
+    assert history.status == "ok"
+    assert history.amplitude(since=350.0) == pytest.approx(cycle.amplitude, rel=1e-4)
 
 
 def test_an_overdamped_mass_creeps_to_its_equilibrium_and_is_not_followed_for_ever():

@@ -1,0 +1,364 @@
+"""How well a controller does: episodes from fixed starts, per-episode metrics, and the score against the optimum.
+
+Every metric is taken from what the integrator reports of whole control intervals (extremes of x, time stuck, mean of
+the belt's speed), never from samples at their ends.
+"""
+
+import functools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sd_friction_env import SDFrictionEnv, Table
+from sd_friction_env.policies import Policy, State, ZeroPolicy
+
+Array = NDArray[np.float64]
+
+# Seeds of reset(). Training draws its own from 2**32 on (training.training_seed), so these are never trained on.
+EVALUATION_SEEDS = range(1_000_000, 1_000_100)  # the protocol's 100 episodes: reported, and used for nothing else
+VALIDATION_SEEDS = range(2_000_000, 2_000_100)  # to choose the best model of a run, and gains
+
+SUPPRESSED_AMPLITUDE = 0.05  # of the passive amplitude
+SUPPRESSED_BELT_SPEED = 0.02  # deviation of the mean from nominal, relative
+SMALLEST_PASSIVE_AMPLITUDE = 1e-3  # where passive motion dies out by itself, amplitudes are compared with this
+
+_REWARD_TERMS = ("vibration", "effort", "stick", "contact_loss")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episodes:
+    """What n episodes of at most T control intervals did; NaN after the end of one that ended early.
+
+    Attributes:
+        seeds: of reset(), shape (n,).
+        control_interval: its length.
+        belt_speed: nominal belt speed of each episode, shape (n,).
+        reward: as the environment gave it, shape (n, T); the four terms of it are in ``reward_terms``, (4, n, T).
+        x_min, x_max: extremes of x in each interval, shape (n, T).
+        stick_fraction, mean_belt_speed, action: of each interval, shape (n, T); the action as applied.
+        completed: whether the episode ran for all of T, shape (n,).
+    """
+
+    seeds: NDArray[np.int64]
+    control_interval: float
+    belt_speed: Array
+    reward: Array
+    reward_terms: Array
+    x_min: Array
+    x_max: Array
+    stick_fraction: Array
+    mean_belt_speed: Array
+    action: Array
+    completed: NDArray[np.bool_]
+
+
+EnvFactory = Callable[[], gym.Env[Any, Any]]
+
+
+def make_env(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> SDFrictionEnv:
+    """Return a bare environment (no wrappers: they cost more than the step itself)."""
+    env = gym.make(env_id, **dict(env_kwargs or {})).unwrapped
+    if not isinstance(env, SDFrictionEnv):
+        raise TypeError(f"env_id must name an environment of sd_friction_env, got {env_id!r}")
+    return env
+
+
+def run_episodes(
+    policy: Policy,
+    env: str | EnvFactory,
+    seeds: Sequence[int] = EVALUATION_SEEDS,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> Episodes:
+    """Run one episode from ``reset(seed=...)`` for each seed, all side by side, and return what happened.
+
+    Args:
+        policy: acts on the batch of all observations.
+        env: id, or a function that returns an :class:`SDFrictionEnv` (wrapped or not).
+        seeds: at least one, each at least 0.
+        env_kwargs: of the environment, with an id.
+
+    Raises:
+        TypeError, ValueError: if there is no seed, one is no such number, or the policy does not fit the environment.
+    """
+    seeds = [int(seed) for seed in seeds]
+    if not seeds or min(seeds) < 0:
+        raise ValueError(f"seeds must be one or more whole numbers >= 0, got {seeds!r}")
+    if isinstance(env, str):
+        envs = [make_env(env, env_kwargs) for _ in seeds]
+    else:
+        envs = []
+        for _ in seeds:
+            bare = env().unwrapped
+            if not isinstance(bare, SDFrictionEnv):
+                raise TypeError(f"env must make an SDFrictionEnv, got {bare!r}")
+            envs.append(bare)
+    n, steps = len(envs), envs[0].task.episode_steps
+    observations = np.stack([bare.reset(seed=seed)[0] for bare, seed in zip(envs, seeds, strict=True)])
+    belt_speed = np.array([bare.parameters.belt_speed for bare in envs])
+    record = np.full((steps, 10, n), np.nan)
+    v_belt = belt_speed.copy()
+    running = list(range(n))
+    completed = np.zeros(n, dtype=bool)
+    state: State = None
+    starts = np.ones(n, dtype=bool)
+    for t in range(steps):
+        actions, state = policy.predict(observations, state, starts, deterministic=True)
+        actions = np.asarray(actions)
+        if actions.shape != (n, 1):
+            raise ValueError(f"the policy returned actions of shape {actions.shape}, not ({n}, 1)")
+        starts = np.zeros(n, dtype=bool)
+        # Fresh observations, for a policy may keep those it was given.
+        observations = observations.copy()
+        ended = []
+        for i in running:
+            observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
+            v_belt_end = info["v_belt"]
+            record[t, :, i] = (
+                reward,
+                info["reward_vibration"],
+                info["reward_effort"],
+                info["reward_stick"],
+                info["reward_contact_loss"],
+                info["x_min"],
+                info["x_max"],
+                info["stick_fraction"],
+                0.5 * (v_belt[i] + v_belt_end),  # exact: the belt accelerates evenly over an interval
+                info["action"],
+            )
+            v_belt[i] = v_belt_end
+            if terminated or truncated:
+                completed[i] = t + 1 == steps and not terminated
+                ended.append(i)
+        if ended:
+            running = [i for i in running if i not in ended]
+    columns = record.transpose(1, 2, 0)
+    return Episodes(
+        seeds=np.array(seeds),
+        control_interval=envs[0].task.control_interval,
+        belt_speed=belt_speed,
+        reward=columns[0],
+        reward_terms=columns[1:5],
+        x_min=columns[5],
+        x_max=columns[6],
+        stick_fraction=columns[7],
+        mean_belt_speed=columns[8],
+        action=columns[9],
+        completed=completed,
+    )
+
+
+def _amplitude(episodes: Episodes, first: int) -> Array:
+    """Half the distance between the extremes of x from interval ``first`` on; NaN if the episode ended early."""
+    x_max, x_min = episodes.x_max[:, first:].max(axis=1), episodes.x_min[:, first:].min(axis=1)
+    return np.asarray(0.5 * (x_max - x_min))
+
+
+def metrics(episodes: Episodes, passive: Episodes) -> Table:
+    """Return one row per episode.
+
+    Args:
+        episodes: to be judged. passive: of the same starts without control.
+
+    Returns:
+        ``seed``; ``return`` and its terms ``return_vibration``, ``return_effort``, ``return_stick``,
+        ``return_contact_loss``; ``steps``; ``completed``; over the last half of the episode ``amplitude`` and
+        ``passive_amplitude``, ``amplitude_reduction`` (1: still, 0: as passive), ``stick_fraction`` and
+        ``belt_speed_ratio`` (mean belt speed over nominal); over its last quarter ``late_amplitude``,
+        ``late_passive_amplitude``, ``late_stick_fraction``, ``late_belt_speed_ratio`` and ``residual_action`` (rms);
+        ``rms_action`` and ``peak_action`` of all of it; ``settling_time`` (the time from which on x stays within 5% of
+        the passive amplitude of where it ends up; NaN: never); ``suppressed``: over the last quarter, the amplitude is
+        under 5% of passive, nothing sticks and the mean belt speed is within 2% of nominal.
+        What belongs to the end of an episode is NaN if it ended early; it then is not suppressed.
+
+    Raises:
+        ValueError: if the passive episodes are not of the same seeds and length.
+    """
+    if not np.array_equal(episodes.seeds, passive.seeds) or episodes.reward.shape != passive.reward.shape:
+        raise ValueError("passive must hold the same episodes: same seeds, same length")
+    steps = episodes.reward.shape[1]
+    half, quarter = steps - max(1, steps // 2), steps - max(1, steps // 4)
+    floor = SMALLEST_PASSIVE_AMPLITUDE
+    amplitude, late_amplitude = _amplitude(episodes, half), _amplitude(episodes, quarter)
+    # A passive episode may lose contact where the controlled one does not: there is then nothing to compare with.
+    passive_amplitude = np.maximum(_amplitude(passive, half), floor)
+    late_passive = np.maximum(_amplitude(passive, quarter), floor)
+    band = SUPPRESSED_AMPLITUDE * late_passive
+    late_stick = episodes.stick_fraction[:, quarter:].mean(axis=1)
+    late_ratio = episodes.mean_belt_speed[:, quarter:].mean(axis=1) / episodes.belt_speed
+    suppressed = (
+        episodes.completed
+        & (late_amplitude < band)
+        & (late_stick == 0.0)
+        & (np.abs(late_ratio - 1.0) <= SUPPRESSED_BELT_SPEED)
+    )
+    centre = 0.5 * (episodes.x_max[:, quarter:].max(axis=1) + episodes.x_min[:, quarter:].min(axis=1))
+    outside = (episodes.x_max > (centre + band)[:, None]) | (episodes.x_min < (centre - band)[:, None])
+    last_outside = np.where(outside.any(axis=1), steps - np.argmax(outside[:, ::-1], axis=1), 0)
+    settled = episodes.completed & (late_amplitude < band)
+    return Table(
+        {
+            "seed": episodes.seeds,
+            "return": np.nansum(episodes.reward, axis=1),
+            **{
+                f"return_{name}": np.nansum(terms, axis=1)
+                for name, terms in zip(_REWARD_TERMS, episodes.reward_terms, strict=True)
+            },
+            "steps": np.isfinite(episodes.reward).sum(axis=1),
+            "completed": episodes.completed,
+            "amplitude": amplitude,
+            "passive_amplitude": passive_amplitude,
+            "amplitude_reduction": 1.0 - amplitude / passive_amplitude,
+            "stick_fraction": episodes.stick_fraction[:, half:].mean(axis=1),
+            "belt_speed_ratio": episodes.mean_belt_speed[:, half:].mean(axis=1) / episodes.belt_speed,
+            "late_amplitude": late_amplitude,
+            "late_passive_amplitude": late_passive,
+            "late_stick_fraction": late_stick,
+            "late_belt_speed_ratio": late_ratio,
+            "residual_action": np.sqrt(np.mean(episodes.action[:, quarter:] ** 2, axis=1)),
+            "rms_action": np.sqrt(np.nanmean(episodes.action**2, axis=1)),
+            "peak_action": np.nanmax(np.abs(episodes.action), axis=1),
+            "settling_time": np.where(settled, last_outside * episodes.control_interval, np.nan),
+            "suppressed": suppressed,
+        }
+    )
+
+
+def evaluate(
+    policy: Policy,
+    env: str | EnvFactory,
+    seeds: Sequence[int] = EVALUATION_SEEDS,
+    env_kwargs: Mapping[str, Any] | None = None,
+    *,
+    passive: Episodes | None = None,
+) -> Table:
+    """Run one episode per seed and return the table of :func:`metrics`.
+
+    Args:
+        policy, env, seeds, env_kwargs: as :func:`run_episodes` takes them.
+        passive: the same episodes without control, if they are at hand (else they are run too, and kept for an id).
+    """
+    if passive is None:
+        passive = passive_episodes(env, seeds, env_kwargs)
+    return metrics(run_episodes(policy, env, seeds, env_kwargs), passive)
+
+
+def passive_episodes(
+    env: str | EnvFactory, seeds: Sequence[int] = EVALUATION_SEEDS, env_kwargs: Mapping[str, Any] | None = None
+) -> Episodes:
+    """Return the episodes of :func:`run_episodes` without control."""
+    if not isinstance(env, str):
+        return run_episodes(ZeroPolicy(), env, seeds)
+    try:
+        key = json.dumps(dict(env_kwargs or {}), sort_keys=True)
+    except TypeError:  # arguments that are no plain data, such as a reward function
+        return run_episodes(ZeroPolicy(), env, seeds, env_kwargs)
+    return _passive_episodes(env, tuple(seeds), key)
+
+
+@functools.lru_cache(maxsize=8)
+def _passive_episodes(env_id: str, seeds: tuple[int, ...], env_kwargs: str) -> Episodes:
+    return run_episodes(ZeroPolicy(), env_id, seeds, json.loads(env_kwargs))
+
+
+# The score ------------------------------------------------------------------------------------------------------------
+
+
+def optimal_returns(env_id: str, seeds: Sequence[int], env_kwargs: Mapping[str, Any] | None = None) -> Array | None:
+    """Return the best known return from each start, shape (n,); None where no optimum is stored (other arguments, the
+    hard tiers, other seeds)."""
+    if env_kwargs:
+        return None
+    try:
+        from agents import optimal
+    except ImportError:
+        return None
+    try:
+        returns = optimal.optimal_returns(env_id, list(seeds))
+    except (FileNotFoundError, ValueError):
+        return None
+    return None if returns is None else np.asarray(returns, dtype=float)
+
+
+def score(returns: Any, passive: Any, optimal: Any) -> float:
+    """Return (mean return - mean passive)/(mean optimal - mean passive) over the same episodes: 0 passive, 1 optimal.
+
+    Raises:
+        ValueError: if the three are not of one shape, or the optimum is no better than passive.
+    """
+    returns, passive, optimal = (np.asarray(values, dtype=float) for values in (returns, passive, optimal))
+    if not returns.shape == passive.shape == optimal.shape or returns.size == 0:
+        shapes = f"{returns.shape}, {passive.shape}, {optimal.shape}"
+        raise ValueError(f"returns, passive and optimal must be of the same episodes, got shapes {shapes}")
+    gap = optimal.mean() - passive.mean()
+    if not gap > 0.0:
+        raise ValueError(f"the optimum must be better than passive, got means {optimal.mean()} and {passive.mean()}")
+    return float((returns.mean() - passive.mean()) / gap)
+
+
+# Name in a summary, column it is the mean of. NaN (ended early, never settled) is left out of means.
+_SUMMARY = {
+    "amplitude": "amplitude",
+    "reduction": "amplitude_reduction",
+    "stick": "stick_fraction",
+    "belt_speed": "belt_speed_ratio",
+    "settling": "settling_time",
+    "rms_action": "rms_action",
+    "residual": "residual_action",
+}
+
+
+def summarise(name: str, table: Table, passive: Table, optimal: Array | None) -> dict[str, Any]:
+    """Return one row for a controller: means over its episodes, its score and its suppressed fraction.
+
+    Args:
+        name: of the controller. table: of :func:`metrics`. passive: the same for no control.
+        optimal: best returns of the same starts, or None (the score then is NaN).
+    """
+    row: dict[str, Any] = {"controller": name, "return": float(table["return"].mean())}
+    row["score"] = float("nan") if optimal is None else score(table["return"], passive["return"], optimal)
+    row["suppressed"] = float(table["suppressed"].mean())
+    for key, column in _SUMMARY.items():
+        finite = table[column][np.isfinite(table[column])]
+        row[key] = float(finite.mean()) if finite.size else float("nan")
+    row["peak_action"] = float(table["peak_action"].max())
+    row["episodes"] = table.n_rows
+    return row
+
+
+_FORMATS = {
+    "return": "{:.2f}",
+    "score": "{:.3f}",
+    "suppressed": "{:.0%}",
+    "amplitude": "{:.5f}",
+    "reduction": "{:.2%}",
+    "stick": "{:.4f}",
+    "belt_speed": "{:.4f}",
+    "settling": "{:.1f}",
+    "rms_action": "{:.3f}",
+    "residual": "{:.4f}",
+    "peak_action": "{:.3f}",
+}
+
+
+def format_summary(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return rows of :func:`summarise` as an aligned text table; "-" where there is no number."""
+    names = ["controller", *_FORMATS]
+    cells = [[name.replace("_", " ") for name in names]]
+    for row in rows:
+        line = [str(row["controller"])]
+        for name, form in _FORMATS.items():
+            value = row.get(name, float("nan"))
+            line.append(form.format(value) if np.isfinite(value) else "-")
+        cells.append(line)
+    widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
+    lines = []
+    for line in cells:
+        name, *numbers = (f"{cell:>{width}}" for cell, width in zip(line, widths, strict=True))
+        lines.append("  ".join([line[0].ljust(len(name)), *numbers]))
+    lines.insert(1, "  ".join("-" * w for w in widths))
+    return "\n".join(lines)

@@ -1,0 +1,294 @@
+"""Run folders: all that is needed to load a trained agent again, and nothing that is executed on loading.
+
+A finished run is a folder with::
+
+    config.json         what was trained, how, with which versions; how to build the network again; the files' digests
+    policy.pt           the best model's weights (a table of tensors; read with weights_only=True)
+    policy.npz          the same actor for plain NumPy (sd_friction_env.policies.load_policy)
+    evaluations.csv     what each evaluation during training gave
+    checkpoints/        the latest weights and optimiser states
+    tensorboard/        event files
+
+While it is being trained, the folder is called ``NAME.partial``; it gets its name, and its config.json the status
+"finished", when all else is written. So a half-written folder never looks like a finished one, whatever it is called.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import pickle
+import shutil
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sd_friction_env.policies import NetworkPolicy, PolicyFileError, load_policy
+from sd_friction_env.tables import atomic_file
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.policies import BasePolicy
+
+FORMAT = 1
+KIND = "sd_friction_env run"
+CONFIG, WEIGHTS, NETWORK, EVALUATIONS = "config.json", "policy.pt", "policy.npz", "evaluations.csv"
+CHECKPOINTS, TENSORBOARD = "checkpoints", "tensorboard"
+PARTIAL = ".partial"
+ALGORITHMS = ("ppo", "sac", "td3", "tqc")
+
+_NEEDED = ("algorithm", "environment", "files", "hyperparameters", "seed", "spaces", "steps", "versions")
+
+
+class RunFolderError(ValueError):
+    """A run folder cannot be used: it is missing, unfinished, damaged, of another kind, or in the way."""
+
+
+# Writing --------------------------------------------------------------------------------------------------------------
+
+
+def partial_folder(folder: Path) -> Path:
+    """Return the name a run folder has while it is being written."""
+    return folder.with_name(folder.name + PARTIAL)
+
+
+def check_free(folder: Path, *, force: bool = False) -> None:
+    """Raise unless a run may be written to ``folder``; nothing is written or removed.
+
+    Args:
+        folder: of the finished run. force: whether a run that is there already may be replaced.
+
+    Raises:
+        RunFolderError: if the name cannot be one, something else is there, or a run is there and ``force`` not given.
+    """
+    if not folder.name or folder.name.endswith(PARTIAL) or folder.name in (".", ".."):
+        raise RunFolderError(f"run folder must have a name that does not end in {PARTIAL!r}, got {str(folder)!r}")
+    for parent in folder.parents:
+        if parent.exists():
+            if not parent.is_dir():
+                raise RunFolderError(f"run folder {str(folder)!r} cannot be made: {str(parent)!r} is a file")
+            if not os.access(parent, os.W_OK):
+                raise RunFolderError(f"run folder {str(folder)!r} cannot be made: {str(parent)!r} is not writable")
+            break
+    for place, what in ((folder, "exists"), (partial_folder(folder), "is there from an unfinished run")):
+        if not place.exists() and not place.is_symlink():
+            continue
+        if not _is_replaceable(place):
+            raise RunFolderError(f"{str(place)!r} exists and is no run folder: choose another --run-folder")
+        if not force:
+            raise RunFolderError(f"{str(place)!r} {what}: choose another --run-folder, or replace it with --force")
+
+
+def _is_replaceable(place: Path) -> bool:
+    """Tell whether removing ``place`` removes a run (or nothing at all) and not something precious."""
+    if place.is_symlink() or not place.is_dir():
+        return False
+    if not any(place.iterdir()):
+        return True
+    try:
+        config = json.loads((place / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(config, dict) and config.get("kind") == KIND
+
+
+def begin(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> Path:
+    """Make the partial folder of a run with its unfinished config.json, and return it.
+
+    Raises:
+        RunFolderError: as :func:`check_free`.
+    """
+    check_free(folder, force=force)
+    partial = partial_folder(folder)
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True)
+    write_json(partial / CONFIG, {"kind": KIND, "format": FORMAT, "status": "unfinished", **config})
+    return partial
+
+
+def finish(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> None:
+    """Give a partial folder its digests, its status and its name.
+
+    Args:
+        folder: of the finished run. config: as :func:`load_config` will return it, without ``files``.
+
+    Raises:
+        RunFolderError: if something has taken the name meanwhile and ``force`` is not given.
+    """
+    partial = partial_folder(folder)
+    files = {name: _digest(partial / name) for name in (WEIGHTS, NETWORK, EVALUATIONS)}
+    content = {"kind": KIND, "format": FORMAT, "status": "finished", **config, "files": files}
+    write_json(partial / CONFIG, content)
+    if folder.exists():
+        if not force or not _is_replaceable(folder):
+            raise RunFolderError(f"{str(folder)!r} exists by now: the finished run is left in {str(partial)!r}")
+        old = folder.with_name(folder.name + ".old" + PARTIAL)
+        if old.exists():
+            shutil.rmtree(old)
+        os.replace(folder, old)
+        os.replace(partial, folder)
+        shutil.rmtree(old)
+    else:
+        os.replace(partial, folder)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file, whole or not at all."""
+    from sd_friction_env.tables import atomic_file
+
+    with atomic_file(path) as file:
+        json.dump(content, file, indent=2, allow_nan=False)
+        file.write("\n")
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
+    """Write tensors and plain values with torch.save, whole or not at all."""
+    import torch
+
+    with atomic_file(path, "wb") as file:
+        torch.save(dict(content), file)
+
+
+def describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
+    """Return a Box as JSON values.
+
+    Raises:
+        TypeError: if it is another space.
+    """
+    if not isinstance(space, spaces.Box):
+        raise TypeError(f"only Box spaces can be described, got {space!r}")
+    return {
+        "type": "Box",
+        "shape": list(space.shape),
+        "dtype": str(space.dtype),
+        "low": space.low.ravel().tolist(),
+        "high": space.high.ravel().tolist(),
+    }
+
+
+def described_space(description: Any) -> spaces.Box:
+    """Return the Box that :func:`describe_space` described.
+
+    Raises:
+        ValueError: if it describes none.
+    """
+    try:
+        if description["type"] != "Box" or description["dtype"] != "float32":
+            raise ValueError
+        low, high = (
+            np.array(description[side], dtype=np.float32).reshape([int(size) for size in description["shape"]])
+            for side in ("low", "high")
+        )
+        return spaces.Box(low, high, dtype=np.float32)
+    except (KeyError, TypeError, ValueError, AssertionError):
+        raise ValueError(f"not the description of a Box of float32: {description!r}") from None
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def load_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the configuration of a finished run, after checking that its files are those that were written.
+
+    Raises:
+        RunFolderError: if the folder is missing, unfinished, damaged, or of another kind or format.
+    """
+    name, place = os.fspath(folder), Path(folder)
+    if not place.is_dir():
+        partial = partial_folder(place) if place.name else place
+        hint = f" (its training did not finish: {str(partial)!r})" if partial.is_dir() else ""
+        raise RunFolderError(f"there is no run folder {name!r}{hint}")
+    try:
+        config = json.loads((place / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{name!r} is not a run folder: its {CONFIG} cannot be read ({error})") from None
+    if not isinstance(config, dict) or config.get("kind") != KIND:
+        raise RunFolderError(f"{name!r} is not a run folder of sd_friction_env")
+    if config.get("format") != FORMAT:
+        raise RunFolderError(f"{name!r} has run format {config.get('format')!r}; this version reads {FORMAT}")
+    if config.get("status") != "finished":
+        raise RunFolderError(f"{name!r} is half-written: its training has not finished")
+    missing = [key for key in _NEEDED if key not in config]
+    if missing or config["algorithm"] not in ALGORITHMS or not isinstance(config["files"], dict):
+        what = f"lacks {missing[0]!r}" if missing else "holds values that cannot be"
+        raise RunFolderError(f"{name!r} is damaged: its {CONFIG} {what}")
+    for file in (WEIGHTS, NETWORK):
+        try:
+            digest = _digest(place / file)
+        except OSError:
+            raise RunFolderError(f"{name!r} is damaged: {file} is missing or cannot be read") from None
+        if digest != config["files"].get(file):
+            raise RunFolderError(f"{name!r} is damaged: {file} is not the file that {CONFIG} speaks of")
+    return config
+
+
+def load_network(folder: str | os.PathLike[str]) -> NetworkPolicy:
+    """Return the agent of a finished run as a policy in plain NumPy.
+
+    Raises:
+        RunFolderError: as :func:`load_config`, or if policy.npz cannot be read.
+    """
+    load_config(folder)
+    try:
+        return load_policy(Path(folder) / NETWORK)
+    except PolicyFileError as error:
+        raise RunFolderError(str(error)) from None
+
+
+def load_torch_policy(folder: str | os.PathLike[str], device: str = "cpu") -> "BasePolicy":
+    """Return the agent of a finished run as Stable-Baselines3's policy, built from config.json.
+
+    Its observations are those of the training environment: a stack of ``environment["frame_stack"]`` of them.
+
+    Raises:
+        RunFolderError: as :func:`load_config`, or if policy.pt is more than a table of tensors, or another network's.
+    """
+    from agents.training import build_policy
+
+    config = load_config(folder)
+    try:
+        observation_space, action_space = (
+            described_space(config["spaces"][kind]) for kind in ("observation", "action")
+        )
+        policy = build_policy(
+            config["algorithm"],
+            observation_space,
+            action_space,
+            config["hyperparameters"].get("policy_kwargs", {}),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunFolderError(f"{os.fspath(folder)!r} is damaged: {error}") from None
+    weights = load_tensors(Path(folder) / WEIGHTS)
+    try:
+        policy.load_state_dict(weights, strict=True)
+    except (RuntimeError, TypeError, AttributeError) as error:
+        reason = str(error).partition("\n")[0]
+        raise RunFolderError(f"{os.fspath(folder)!r} is damaged: {WEIGHTS} does not fit {CONFIG} ({reason})") from None
+    policy.set_training_mode(False)
+    return policy.to(device)
+
+
+def load_tensors(path: Path) -> dict[str, Any]:
+    """Return what :func:`save_tensors` wrote; a file that asks for code to be run is refused.
+
+    Raises:
+        RunFolderError: if it is anything but a table of tensors and plain values.
+    """
+    import torch
+
+    content: Any = None
+    refusals = (pickle.UnpicklingError, RuntimeError, ValueError, EOFError, OSError, KeyError, TypeError, UserWarning)
+    with contextlib.suppress(*refusals), warnings.catch_warnings():
+        warnings.simplefilter("error")  # torch only warns of pickles that it did not write
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    if not isinstance(content, dict):
+        raise RunFolderError(f"{str(path)!r} is not a table of tensors: refused")
+    return content

@@ -1,0 +1,866 @@
+"""Training with Stable-Baselines3: hyperparameters as data, and one folder per run (see :mod:`agents.runs`)."""
+
+import ast
+import dataclasses
+import inspect
+import json
+import math
+import numbers
+import operator
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import sb3_contrib
+import stable_baselines3
+import torch
+import yaml
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor
+from torch import nn
+from tqdm import tqdm
+
+import sd_friction_env
+from agents import evaluation, runs
+from sd_friction_env import ENVIRONMENT_IDS, SDFrictionEnv, Table
+from sd_friction_env.policies import NetworkPolicy
+from sd_friction_env.wrappers import LARGEST_POWER, LARGEST_SCALE, SMALLEST_POWER, SMALLEST_SCALE, scaled_reward
+
+HYPERPARAMETERS = Path(__file__).parent / "hyperparameters"
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "ppo": stable_baselines3.PPO,
+    "sac": stable_baselines3.SAC,
+    "td3": stable_baselines3.TD3,
+    "tqc": sb3_contrib.TQC,
+}
+ACTIVATIONS: dict[str, type[nn.Module]] = {"Tanh": nn.Tanh, "ReLU": nn.ReLU}
+
+LARGEST_SEED = 2**32 - 1
+_WRAPPER = "sd_friction_env.wrappers.ScaledReward"
+_FOLLOWED_ENVS = 16  # whose statistics go to TensorBoard: enough for a smooth curve, and cheap
+_KEPT_CHECKPOINTS = 2
+
+
+# Hyperparameters ------------------------------------------------------------------------------------------------------
+#
+# RL Zoo evaluates some strings of its files as Python. We read the same strings without ever running them.
+
+
+@dataclass(frozen=True)
+class _Number:
+    low: float
+    high: float
+    whole: bool = False
+
+    def check(self, name: str, value: Any) -> float | int:
+        kind = "whole number" if self.whole else "number"
+        low, high = (f"{end:.0f}" if self.whole else f"{end:g}" for end in (self.low, self.high))
+        said = f"{name} must be a {kind} in [{low}, {high}], got {value!r}"
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            raise TypeError(said)
+        number = float(value)
+        if not self.low <= number <= self.high or (self.whole and number != int(number)):
+            raise ValueError(said)
+        return int(number) if self.whole else number
+
+
+_POSITIVE = _Number(1, 10**12, whole=True)
+_SHARE = _Number(0.0, 1.0)
+_NUMBERS: dict[str, _Number] = {
+    # ours and RL Zoo's
+    "n_envs": _Number(1, 65536, whole=True),
+    "n_timesteps": _POSITIVE,
+    "frame_stack": _Number(1, 1000, whole=True),
+    "noise_std": _Number(0.0, 10.0),
+    # Stable-Baselines3's
+    "batch_size": _Number(2, 10**9, whole=True),
+    "buffer_size": _POSITIVE,
+    "clip_range": _Number(1e-6, 1e6),
+    "clip_range_vf": _Number(1e-6, 1e6),
+    "ent_coef": _Number(0.0, 1e6),
+    "gae_lambda": _SHARE,
+    "gamma": _SHARE,
+    "gradient_steps": _Number(-1, 10**9, whole=True),
+    "learning_rate": _Number(0.0, 1.0),
+    "learning_starts": _Number(0, 10**12, whole=True),
+    "max_grad_norm": _Number(0.0, 1e12),
+    "n_epochs": _POSITIVE,
+    "n_steps": _POSITIVE,
+    "policy_delay": _POSITIVE,
+    "target_entropy": _Number(-1e6, 1e6),
+    "target_kl": _Number(1e-12, 1e6),
+    "target_noise_clip": _Number(0.0, 1e6),
+    "target_policy_noise": _Number(0.0, 1e6),
+    "target_update_interval": _POSITIVE,
+    "tau": _SHARE,
+    "top_quantiles_to_drop_per_net": _Number(0, 1000, whole=True),
+    "train_freq": _POSITIVE,
+    "vf_coef": _Number(0.0, 1e6),
+}
+_SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
+_FLAGS = ("normalize_advantage",)
+_OURS = ("n_envs", "n_timesteps", "frame_stack", "env_wrapper", "policy", "policy_kwargs", "noise_type", "noise_std")
+_NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
+_POLICY_NUMBERS = {
+    "log_std_init": _Number(-20.0, 5.0),
+    "n_critics": _Number(1, 100, whole=True),
+    "n_quantiles": _Number(1, 1000, whole=True),
+}
+_WIDTH = _Number(1, 8192, whole=True)
+
+
+def allowed_hyperparameters(algorithm: str) -> tuple[str, ...]:
+    """Return the names that hyperparameters of an algorithm may have."""
+    taken = set(inspect.signature(ALGORITHMS[algorithm]).parameters)
+    names = {*_NUMBERS, *_FLAGS} & taken
+    if "action_noise" not in taken:
+        return tuple(sorted(names | set(_OURS) - {"noise_type", "noise_std"}))
+    return tuple(sorted(names | set(_OURS)))
+
+
+def read_hyperparameters(algorithm: str, env_id: str, path: Path | None = None) -> dict[str, Any]:
+    """Return the checked hyperparameters of an environment from an RL Zoo file.
+
+    Args:
+        algorithm: one of ``ALGORITHMS``. env_id: a key of the file. path: of the file; None: the one shipped.
+
+    Raises:
+        ValueError: if the algorithm is unknown, the file cannot be read or a value is not allowed, naming it.
+    """
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, got {algorithm!r}")
+    file = HYPERPARAMETERS / f"{algorithm}.yml" if path is None else path
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"hyperparameters cannot be read from {str(file)!r}: {_one_line(error)}") from None
+    if not isinstance(content, dict) or not isinstance(content.get(env_id), dict):
+        known = ", ".join(map(str, content)) if isinstance(content, dict) else "nothing"
+        raise ValueError(f"{str(file)!r} has no hyperparameters for {env_id!r}; it has: {known}")
+    return check_hyperparameters(algorithm, content[env_id])
+
+
+def check_hyperparameters(algorithm: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return hyperparameters as JSON values (``policy_kwargs`` as a mapping), after checking every one.
+
+    Raises:
+        TypeError, ValueError: naming the hyperparameter, its value and what is allowed.
+    """
+    allowed = allowed_hyperparameters(algorithm)
+    unknown = sorted(str(name) for name in settings if name not in allowed)
+    if unknown:
+        raise ValueError(f"{algorithm} has no hyperparameter {unknown[0]!r}; allowed: {', '.join(allowed)}")
+    return {str(name): _checked_hyperparameter(name, value) for name, value in settings.items()}
+
+
+def _checked_hyperparameter(name: str, value: Any) -> Any:
+    if name == "policy":
+        return _checked_one_of(name, value, ("MlpPolicy",))
+    if name == "noise_type":
+        return _checked_one_of(name, value, tuple(_NOISES))
+    if name == "policy_kwargs":
+        return parse_policy_kwargs(value)
+    if name == "env_wrapper":
+        return _checked_wrapper(value)
+    if name in _FLAGS:
+        if not isinstance(value, bool):
+            raise TypeError(f"{name} must be true or false, got {value!r}")
+        return value
+    if name == "ent_coef" and isinstance(value, str):
+        kind, _, start = value.partition("_")
+        if kind == "auto" and (not start or _float(start) > 0.0):
+            return value
+        raise ValueError(
+            f'ent_coef must be a number in [0, 1e+06], "auto" or "auto_START" with START > 0, got {value!r}'
+        )
+    if name == "target_entropy" and value == "auto":
+        return value
+    if name in _SCHEDULED and isinstance(value, str):
+        kind, _, start = value.partition("_")
+        if kind != "lin":
+            raise ValueError(f'{name} must be a number or "lin_START" (falling linearly to 0), got {value!r}')
+        _NUMBERS[name].check(name, _float(start))
+        return value
+    return _NUMBERS[name].check(name, value)
+
+
+def _checked_one_of(name: str, value: Any, choices: Sequence[str]) -> str:
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+    return str(value)
+
+
+def _checked_wrapper(value: Any) -> Any:
+    """Only rewards may be wrapped: what an agent observes must be what its policy file is run on."""
+    entries = value if isinstance(value, list) else [value]
+    for entry in entries:
+        arguments = entry.get(_WRAPPER) if isinstance(entry, dict) and list(entry) == [_WRAPPER] else None
+        if not isinstance(arguments, dict) or not {"scale"} <= set(arguments) <= {"scale", "power"} or len(entries) > 1:
+            raise ValueError(f"env_wrapper must be one {_WRAPPER} with its scale (and power), got {value!r}")
+        _Number(SMALLEST_SCALE, LARGEST_SCALE).check("env_wrapper's scale", arguments["scale"])
+        _Number(SMALLEST_POWER, LARGEST_POWER).check("env_wrapper's power", arguments.get("power", 1.0))
+    return value
+
+
+def reward_scaling(settings: Mapping[str, Any]) -> tuple[float, float]:
+    """Return scale and power of the rewards that hyperparameters ask for (see :class:`ScaledReward`)."""
+    value = settings.get("env_wrapper", [])
+    entries = value if isinstance(value, list) else [value]
+    arguments = entries[0][_WRAPPER] if entries else {"scale": 1.0}
+    return float(arguments["scale"]), float(arguments.get("power", 1.0))
+
+
+def parse_policy_kwargs(value: Any) -> dict[str, Any]:
+    """Return RL Zoo's ``policy_kwargs``, such as "dict(net_arch=[64, 64], activation_fn=nn.Tanh)", as JSON values.
+
+    The string is parsed, never run: calls of ``dict``, literals and the activations in ``ACTIVATIONS`` are understood.
+    A mapping (as :mod:`agents.runs` stores it) is checked likewise.
+
+    Raises:
+        ValueError: if there is anything else in it.
+    """
+    if isinstance(value, str):
+        try:
+            value = _literal(ast.parse(value.strip(), mode="eval").body)
+        except (SyntaxError, RecursionError, MemoryError):
+            raise ValueError(f"policy_kwargs is not an expression: {value!r}") from None
+    if not isinstance(value, Mapping):
+        raise ValueError(f"policy_kwargs must be dict(...), got {value!r}")
+    checked: dict[str, Any] = {}
+    for name, part in value.items():
+        if name == "activation_fn":
+            checked[name] = _checked_one_of(name, part, tuple(ACTIVATIONS))
+        elif name == "net_arch":
+            checked[name] = _checked_net_arch(part)
+        elif name == "ortho_init":
+            if not isinstance(part, bool):
+                raise ValueError(f"ortho_init must be True or False, got {part!r}")
+            checked[name] = part
+        elif name in _POLICY_NUMBERS:
+            checked[name] = _POLICY_NUMBERS[name].check(name, part)
+        else:
+            names = ", ".join(["net_arch", "activation_fn", "ortho_init", *_POLICY_NUMBERS])
+            raise ValueError(f"policy_kwargs has no {name!r}; allowed: {names}")
+    return checked
+
+
+def _checked_net_arch(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        if not set(value) <= {"pi", "vf", "qf"}:
+            raise ValueError(f"net_arch must have parts pi, vf or qf, got {value!r}")
+        return {name: _checked_net_arch(part) for name, part in value.items()}
+    if not isinstance(value, list) or len(value) > 32:
+        raise ValueError(f"net_arch must be a list of layer widths, got {value!r}")
+    return [_WIDTH.check("a width in net_arch", width) for width in value]
+
+
+def _literal(node: ast.expr) -> Any:
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "dict" and not node.args:
+        return {_keyword(keyword): _literal(keyword.value) for keyword in node.keywords}
+    if isinstance(node, ast.Dict):
+        return {_key(key): _literal(part) for key, part in zip(node.keys, node.values, strict=True)}
+    if isinstance(node, ast.List):
+        return [_literal(part) for part in node.elts]
+    if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "nn":
+        return _checked_one_of("activation_fn", node.attr, tuple(ACTIVATIONS))
+    try:
+        return ast.literal_eval(node)
+    except (ValueError, TypeError):
+        raise ValueError(
+            f"policy_kwargs may hold literals and nn.{', nn.'.join(ACTIVATIONS)}; got {ast.unparse(node)!r}"
+        ) from None
+
+
+def _keyword(keyword: ast.keyword) -> str:
+    if keyword.arg is None:
+        raise ValueError("policy_kwargs may not hold **")
+    return keyword.arg
+
+
+def _key(node: ast.expr | None) -> str:
+    if not isinstance(node, ast.Constant) or not isinstance(node.value, str):
+        raise ValueError("policy_kwargs may only have strings as keys")
+    return node.value
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _policy_arguments(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return checked policy keyword arguments as Stable-Baselines3 takes them."""
+    arguments = dict(policy_kwargs)
+    if "activation_fn" in arguments:
+        arguments["activation_fn"] = ACTIVATIONS[arguments["activation_fn"]]
+    return arguments
+
+
+def build_policy(
+    algorithm: str, observation_space: spaces.Box, action_space: spaces.Box, policy_kwargs: Mapping[str, Any]
+) -> BasePolicy:
+    """Return an untrained policy of Stable-Baselines3.
+
+    Args:
+        policy_kwargs: JSON values, as :func:`parse_policy_kwargs` returns them.
+
+    Raises:
+        TypeError, ValueError: if they are not.
+    """
+    policy_class = ALGORITHMS[algorithm].policy_aliases["MlpPolicy"]
+    arguments = _policy_arguments(parse_policy_kwargs(policy_kwargs))
+    return policy_class(observation_space, action_space, lambda _: 0.0, **arguments)
+
+
+# The plan -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """All that decides what a run gives.
+
+    Attributes:
+        env_id, env_kwargs: of the environment (JSON values).
+        algorithm: one of ``ALGORITHMS``.
+        hyperparameters: checked; ``n_envs`` and ``n_timesteps`` among them.
+        seed: of everything random, in [0, 2**32 - 1].
+        eval_freq: environment steps between two evaluations.
+        eval_episodes: episodes of each, from ``evaluation.VALIDATION_SEEDS``.
+        device: as torch names it. threads: of torch.
+    """
+
+    env_id: str
+    env_kwargs: Mapping[str, Any]
+    algorithm: str
+    hyperparameters: Mapping[str, Any]
+    seed: int
+    eval_freq: int
+    eval_episodes: int
+    device: str
+    threads: int
+
+    @property
+    def steps(self) -> int:
+        """Environment steps to train for (at least)."""
+        return int(self.hyperparameters["n_timesteps"])
+
+
+def make_plan(
+    env_id: str,
+    algorithm: str,
+    *,
+    env_kwargs: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    hyperparameter_file: Path | None = None,
+    timesteps: int | None = None,
+    envs: int | None = None,
+    seed: int = 0,
+    eval_freq: int | None = None,
+    eval_episodes: int = 20,
+    device: str = "cpu",
+    threads: int = 1,
+) -> Plan:
+    """Return a checked plan; nothing is written.
+
+    Args:
+        overrides: hyperparameters that replace those of the file.
+        timesteps, envs: replace ``n_timesteps`` and ``n_envs``.
+        eval_freq: None: a twentieth of the steps.
+        The others as :class:`Plan` has them.
+
+    Raises:
+        TypeError, ValueError: naming the argument, its value and what is allowed.
+    """
+    if env_id not in ENVIRONMENT_IDS:
+        raise ValueError(f"env-id must be one of {', '.join(ENVIRONMENT_IDS)}, got {env_id!r}")
+    settings = read_hyperparameters(algorithm, env_id, hyperparameter_file)
+    settings |= check_hyperparameters(algorithm, dict(overrides or {}))
+    if timesteps is not None:
+        settings["n_timesteps"] = _NUMBERS["n_timesteps"].check("timesteps", timesteps)
+    if envs is not None:
+        settings["n_envs"] = _NUMBERS["n_envs"].check("envs", envs)
+    settings.setdefault("n_envs", 1)
+    if "n_timesteps" not in settings:
+        raise ValueError("n_timesteps is given neither in the hyperparameters nor by timesteps")
+    if "noise_std" in settings and "noise_type" not in settings:
+        raise ValueError(f"noise_std needs a noise_type beside it: {', '.join(_NOISES)}")
+    if algorithm == "ppo":
+        rollout = settings["n_envs"] * settings.get("n_steps", 2048)
+        # A batch larger than what there is to learn from, or one that does not divide it, leaves crumbs.
+        settings["batch_size"] = math.gcd(rollout, settings.get("batch_size", 64))
+        if settings["batch_size"] < 2:
+            settings["batch_size"] = rollout
+        if rollout < 2:
+            raise ValueError(f"n_envs x n_steps must be at least 2, got {rollout}")
+    try:
+        kwargs = json.loads(json.dumps(dict(env_kwargs or {}), allow_nan=False))
+    except (TypeError, ValueError):
+        raise ValueError(f"environment arguments must be plain finite values, got {env_kwargs!r}") from None
+    try:
+        evaluation.make_env(env_id, kwargs).close()  # the environment itself knows what it takes
+    except (TypeError, ValueError) as error:
+        reason = str(error).partition(" was raised from")[0]  # which Gymnasium adds
+        raise ValueError(f"the environment refuses its arguments: {reason}") from None
+    if device not in ("cpu", "auto") and not (device.partition(":")[0] == "cuda" and torch.cuda.is_available()):
+        cuda = ", cuda" if torch.cuda.is_available() else " (no CUDA device is there)"
+        raise ValueError(f"device must be one of cpu, auto{cuda}, got {device!r}")
+    most = len(evaluation.VALIDATION_SEEDS)
+    if eval_freq is None:
+        eval_freq = max(1, settings["n_timesteps"] // 20)
+    return Plan(
+        env_id=env_id,
+        env_kwargs=kwargs,
+        algorithm=algorithm,
+        hyperparameters=settings,
+        seed=int(_Number(0, LARGEST_SEED, whole=True).check("seed", seed)),
+        eval_freq=int(_POSITIVE.check("eval-freq", eval_freq)),
+        eval_episodes=int(_Number(1, most, whole=True).check("eval-episodes", eval_episodes)),
+        device=device,
+        threads=int(_Number(1, 1024, whole=True).check("threads", threads)),
+    )
+
+
+def validation_seeds(plan: Plan) -> range:
+    """Return the seeds of the episodes by which a run chooses its best model."""
+    return evaluation.VALIDATION_SEEDS[: plan.eval_episodes]
+
+
+def training_seed(seed: int, index: int = 0) -> int:
+    """Return the seed of a run's environment: at least 2**32, where no evaluation seed is, and in no other run."""
+    return (1 + seed) * 2**32 + index
+
+
+# Environments ---------------------------------------------------------------------------------------------------------
+
+
+class _BareEnvs(DummyVecEnv):
+    """Environments side by side, without the deep copies that cost Stable-Baselines3 more than our step does."""
+
+    def reset(self) -> Any:
+        observations = super().reset()
+        for i, env in enumerate(self.envs):
+            bare = env.unwrapped
+            assert isinstance(bare, SDFrictionEnv)
+            steps = i * bare.task.episode_steps // self.num_envs
+            bare.set_state(dataclasses.replace(bare.get_state(), steps=steps))
+        return observations
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        n = self.num_envs
+        # Fresh arrays, for Stable-Baselines3 keeps those of the step before.
+        observations = np.empty((n, *self.observation_space.shape), np.float32)  # type: ignore[misc]
+        rewards = np.empty(n, np.float32)
+        dones = np.zeros(n, dtype=bool)
+        infos = []
+        for i, (env, action) in enumerate(zip(self.envs, self.actions, strict=True)):
+            observation, rewards[i], terminated, truncated, info = env.step(action)
+            info["TimeLimit.truncated"] = truncated and not terminated
+            if terminated or truncated:
+                dones[i] = True
+                info["terminal_observation"] = observation
+                observation, self.reset_infos[i] = env.reset()
+            observations[i] = observation
+            infos.append(info)
+        return observations, rewards, dones, infos
+
+
+class _ScaledRewards(VecEnvWrapper):
+    def __init__(self, envs: VecEnv, scale: float, power: float) -> None:
+        super().__init__(envs)
+        self.scale, self.power = scale, power
+
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations, scaled_reward(rewards, self.scale, self.power).astype(np.float32), dones, infos
+
+
+def make_training_envs(
+    env_id: str,
+    env_kwargs: Mapping[str, Any],
+    n_envs: int,
+    seed: int,
+    *,
+    frame_stack: int = 1,
+    scaling: tuple[float, float] = (1.0, 1.0),
+) -> VecEnv:
+    """Return seeded environments to train on: monitored, rewards scaled, observations stacked.
+
+    Args:
+        seed: of the run; environment i is reset with ``training_seed(seed, i)``.
+        frame_stack: observations seen at once. scaling: scale and power of the rewards that the algorithm sees.
+
+    The first episodes are cut short, each by another share, so that the environments do not all start over at the same
+    moment ever after: every batch then holds squealing, settling and settled motion in their due shares.
+    """
+
+    def make() -> gym.Env[Any, Any]:
+        env: gym.Env[Any, Any] = evaluation.make_env(env_id, env_kwargs)
+        return env
+
+    envs: VecEnv = VecMonitor(_BareEnvs([make] * n_envs))
+    if scaling != (1.0, 1.0):
+        envs = _ScaledRewards(envs, *scaling)
+    if frame_stack > 1:
+        envs = VecFrameStack(envs, frame_stack)
+    envs.seed(training_seed(seed))
+    return envs
+
+
+# The agent ------------------------------------------------------------------------------------------------------------
+
+
+def make_model(plan: Plan, envs: VecEnv) -> BaseAlgorithm:
+    """Return the untrained model of a plan."""
+    ours = set(_OURS)
+    arguments = {name: value for name, value in plan.hyperparameters.items() if name not in ours}
+    for name in _SCHEDULED:
+        if isinstance(arguments.get(name), str):
+            arguments[name] = LinearSchedule(float(arguments[name].partition("_")[2]), 0.0, 1.0)
+    noise = plan.hyperparameters.get("noise_type")
+    if noise is not None:
+        std = plan.hyperparameters.get("noise_std", 0.1)
+        arguments["action_noise"] = _NOISES[noise](mean=np.zeros(1), sigma=np.full(1, std))
+    model = ALGORITHMS[plan.algorithm](
+        "MlpPolicy",
+        envs,
+        policy_kwargs=_policy_arguments(plan.hyperparameters.get("policy_kwargs", {})),
+        seed=plan.seed,
+        device=plan.device,
+        **arguments,
+    )
+    envs.seed(training_seed(plan.seed))  # the constructor has seeded them its own way
+    return model
+
+
+def network_policy(policy: BasePolicy, frames: int = 1, metadata: Mapping[str, Any] | None = None) -> NetworkPolicy:
+    """Return the deterministic actor of a policy as one in plain NumPy.
+
+    Args:
+        policy: of PPO, SAC, TD3 or TQC, with a plain multilayer perceptron.
+        frames: observations it sees at once. metadata: JSON values to go with it.
+
+    Raises:
+        TypeError: if the actor is something else.
+    """
+    agent: Any = policy  # torch.nn.Module hides the types of its attributes
+    if hasattr(agent, "mlp_extractor"):  # PPO: no squashing, the action is clipped
+        modules, output = [*agent.mlp_extractor.policy_net, agent.action_net], "clip"
+    elif hasattr(agent.actor, "latent_pi"):  # SAC, TQC
+        modules, output = [*agent.actor.latent_pi, agent.actor.mu], "tanh"
+    else:  # TD3: its own last module is the tanh
+        *modules, last = agent.actor.mu
+        if not isinstance(last, nn.Tanh):
+            raise TypeError(f"the actor must end in tanh, not {last!r}")
+        output = "tanh"
+    linear, between = modules[::2], modules[1::2]
+    names = {name for name, kind in ACTIVATIONS.items() if any(type(module) is kind for module in between)}
+    known = all(type(module) in ACTIVATIONS.values() for module in between) and len(names) <= 1
+    if not known or not all(type(module) is nn.Linear for module in linear):
+        raise TypeError(f"the actor must be linear layers with one activation between them, got {modules!r}")
+    layers = tuple(
+        (module.weight.detach().cpu().numpy().T.astype(float), module.bias.detach().cpu().numpy().astype(float))
+        for module in linear
+    )
+    return NetworkPolicy(layers, names.pop() if names else "Tanh", output, frames, dict(metadata or {}))
+
+
+# Training -------------------------------------------------------------------------------------------------------------
+
+
+class StoppedError(Exception):
+    """Training was asked to stop before its end.
+
+    Attributes:
+        steps: done so far. checkpoint: the file with the latest weights.
+    """
+
+    def __init__(self, steps: int, checkpoint: Path) -> None:
+        super().__init__(f"stopped after {steps:,} steps; the last checkpoint is {str(checkpoint)!r}")
+        self.steps = steps
+        self.checkpoint = checkpoint
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a finished run came to.
+
+    Attributes:
+        folder: of the run. policy: the best model's actor. steps: done in all. seconds: wall time of training.
+        best: the row of evaluations.csv that the best model gave. evaluations: all rows.
+    """
+
+    folder: Path
+    policy: NetworkPolicy
+    steps: int
+    seconds: float
+    best: Mapping[str, Any]
+    evaluations: Table
+
+
+_STATISTICS = ("x_min", "x_max", "stick_fraction", "reward_vibration", "reward_effort", "reward_stick")
+_read_statistics = operator.itemgetter(*_STATISTICS, "reward_contact_loss")
+
+
+class _Statistics:
+    """Amplitude and stick over the last quarter of each training episode, and the reward's terms over all of it."""
+
+    def __init__(self, n_envs: int, episode_steps: int) -> None:
+        self.followed = min(n_envs, _FOLLOWED_ENVS)
+        self.late = episode_steps - max(1, episode_steps // 4)
+        self.steps = np.zeros(self.followed, dtype=int)
+        self.low = np.full(self.followed, np.inf)
+        self.high = np.full(self.followed, -np.inf)
+        self.stick = np.zeros(self.followed)
+        self.terms = np.zeros((self.followed, 4))
+
+    def add(self, infos: Sequence[Mapping[str, Any]], dones: NDArray[np.bool_], logger: Logger) -> None:
+        """Take note of one step of all environments, and of the episodes that end with it."""
+        values = np.array([_read_statistics(info) for info in infos[: self.followed]], dtype=float)
+        self.terms += values[:, 3:]
+        late = self.steps >= self.late
+        if late.any():
+            self.low[late] = np.minimum(self.low, values[:, 0])[late]
+            self.high[late] = np.maximum(self.high, values[:, 1])[late]
+            self.stick[late] += values[late, 2]
+        self.steps += 1
+        for i in np.flatnonzero(dones[: self.followed]):
+            if self.steps[i] > self.late:
+                logger.record_mean("episode/late_amplitude", 0.5 * float(self.high[i] - self.low[i]))
+                logger.record_mean("episode/late_stick_fraction", float(self.stick[i] / (self.steps[i] - self.late)))
+            for name, value in zip(("vibration", "effort", "stick", "contact_loss"), self.terms[i], strict=True):
+                logger.record_mean(f"episode/reward_{name}", float(value))
+            self.steps[i] = 0
+            self.low[i], self.high[i] = np.inf, -np.inf
+            self.stick[i] = 0.0
+            self.terms[i] = 0.0
+
+
+class _Supervisor(BaseCallback):
+    """Watches a run: statistics, evaluation, the best model, checkpoints, progress, and the wish to stop."""
+
+    def __init__(
+        self, plan: Plan, folder: Path, episode_steps: int, progress: bool, should_stop: Callable[[], bool]
+    ) -> None:
+        super().__init__()
+        self.plan = plan
+        self.folder = folder
+        self.statistics = _Statistics(plan.hyperparameters["n_envs"], episode_steps)
+        self.should_stop = should_stop
+        self.stopped = False
+        self.rows: list[dict[str, Any]] = []
+        self.best: dict[str, Any] = {}
+        self.best_key = (-math.inf, -math.inf)
+        self.best_weights: dict[str, torch.Tensor] = {}
+        self.next_evaluation = plan.eval_freq
+        self.seeds = validation_seeds(plan)
+        self.started = time.perf_counter()
+        self.bar = tqdm(
+            total=plan.steps,
+            desc=f"{plan.algorithm} {plan.env_id}",
+            unit=" steps",
+            unit_scale=True,
+            disable=not progress,
+            dynamic_ncols=True,
+            mininterval=0.5,
+        )
+
+    def _on_training_start(self) -> None:
+        self.started = time.perf_counter()
+        (self.folder / runs.CHECKPOINTS).mkdir(exist_ok=True)
+
+    def _on_step(self) -> bool:
+        self.statistics.add(self.locals["infos"], self.locals["dones"], self.logger)
+        self.bar.update(min(self.num_timesteps, self.plan.steps) - self.bar.n)
+        self.stopped = self.should_stop()
+        return not self.stopped
+
+    def _on_rollout_start(self) -> None:
+        # Between rollouts: PPO's policy does not change during one.
+        if self.num_timesteps >= self.next_evaluation and self.num_timesteps < self.plan.steps:
+            self.next_evaluation = (self.num_timesteps // self.plan.eval_freq + 1) * self.plan.eval_freq
+            self.evaluate()
+            self.save_checkpoint()
+
+    def actor(self) -> NetworkPolicy:
+        """Return the present actor."""
+        plan = self.plan
+        about = {
+            "env_id": plan.env_id,
+            "env_kwargs": dict(plan.env_kwargs),
+            "algorithm": plan.algorithm,
+            "seed": plan.seed,
+            "steps": self.num_timesteps,
+            "sd_friction_env": sd_friction_env.__version__,
+        }
+        return network_policy(self.model.policy, plan.hyperparameters.get("frame_stack", 1), about)
+
+    def evaluate(self) -> None:
+        """Evaluate the present actor; keep its weights if it is the best so far.
+
+        Best is the highest mean of the returns, where an episode that was not suppressed counts no more than a
+        passive one: a return alone would prefer a belt that runs slow for ever to one that is back at its speed.
+        """
+        plan = self.plan
+        passive = evaluation.passive_episodes(plan.env_id, self.seeds, plan.env_kwargs)
+        table = evaluation.evaluate(self.actor(), plan.env_id, self.seeds, plan.env_kwargs, passive=passive)
+        passive_returns = np.nansum(passive.reward, axis=1)
+        credited = np.where(table["suppressed"], table["return"], np.minimum(table["return"], passive_returns))
+        row = {
+            "steps": self.num_timesteps,
+            "seconds": round(time.perf_counter() - self.started, 3),
+            "mean_return": float(table["return"].mean()),
+            "std_return": float(table["return"].std()),
+            "credited_return": float(credited.mean()),
+            "suppressed": float(table["suppressed"].mean()),
+            "amplitude_reduction": float(table["amplitude_reduction"].mean()),
+            "stick_fraction": float(table["stick_fraction"].mean()),
+            "belt_speed_ratio": float(table["belt_speed_ratio"].mean()),
+            "rms_action": float(table["rms_action"].mean()),
+        }
+        self.rows.append(row)
+        self.table().to_csv(self.folder / runs.EVALUATIONS)
+        for name, value in row.items():
+            if name != "steps":
+                self.logger.record(f"eval/{name}", value)
+        key = (row["credited_return"], row["mean_return"])
+        if key > self.best_key:
+            self.best, self.best_key = row, key
+            self.best_weights = {name: part.detach().clone() for name, part in self.model.policy.state_dict().items()}
+            runs.save_tensors(self.folder / runs.WEIGHTS, self.best_weights)
+        self.bar.set_postfix_str(f"return {row['mean_return']:.1f}, suppressed {row['suppressed']:.0%}")
+
+    def table(self) -> Table:
+        """Return all evaluations so far."""
+        return Table({name: [row[name] for row in self.rows] for name in self.rows[0]})
+
+    def save_checkpoint(self) -> Path:
+        """Write weights and optimiser states, remove all but the last few, and return the new file."""
+        place = self.folder / runs.CHECKPOINTS
+        path = place / f"step_{self.num_timesteps:012d}.pt"
+        runs.save_tensors(path, {"steps": self.num_timesteps, "parameters": self.model.get_parameters()})
+        for old in sorted(place.glob("step_*.pt"))[:-_KEPT_CHECKPOINTS]:
+            old.unlink()
+        return path
+
+
+def train(
+    plan: Plan,
+    folder: Path,
+    *,
+    force: bool = False,
+    progress: bool = True,
+    command: str = "",
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Result:
+    """Train an agent and write its run folder (see :mod:`agents.runs`).
+
+    The global random states of random, NumPy and torch are seeded: Stable-Baselines3 draws from them.
+
+    Args:
+        folder: of the finished run. force: replace a run that is there.
+        progress: show a progress bar on standard error. command: what the user typed, for the record.
+        should_stop: asked after every step; once it says True, training stops with a last checkpoint.
+
+    Raises:
+        agents.runs.RunFolderError: if the folder is taken; nothing is then written.
+        StoppedError: if ``should_stop`` said so; the folder keeps its partial name.
+    """
+    frames = int(plan.hyperparameters.get("frame_stack", 1))
+    runs.check_free(folder, force=force)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(plan.threads)
+    envs = make_training_envs(
+        plan.env_id,
+        plan.env_kwargs,
+        plan.hyperparameters["n_envs"],
+        plan.seed,
+        frame_stack=frames,
+        scaling=reward_scaling(plan.hyperparameters),
+    )
+    supervisor: _Supervisor | None = None
+    logger: Logger | None = None
+    try:
+        model = make_model(plan, envs)
+        config = {
+            "environment": {"id": plan.env_id, "kwargs": dict(plan.env_kwargs), "frame_stack": frames},
+            "algorithm": plan.algorithm,
+            "hyperparameters": dict(plan.hyperparameters),
+            "seed": plan.seed,
+            "evaluation": {
+                "freq": plan.eval_freq,
+                "episodes": plan.eval_episodes,
+                "first_seed": validation_seeds(plan)[0],
+            },
+            "device": plan.device,
+            "threads": plan.threads,
+            "spaces": {
+                "observation": runs.describe_space(envs.observation_space),
+                "action": runs.describe_space(envs.action_space),
+            },
+            "versions": versions(),
+            "command": command,
+        }
+        partial = runs.begin(folder, config, force=force)
+        logger = Logger(None, [TensorBoardOutputFormat(str(partial / runs.TENSORBOARD))])
+        model.set_logger(logger)
+        episode_steps = evaluation.make_env(plan.env_id, plan.env_kwargs).task.episode_steps
+        supervisor = _Supervisor(plan, partial, episode_steps, progress, should_stop)
+        # Off-policy algorithms log per episode, and all environments end theirs together.
+        log_interval = 1 if plan.algorithm == "ppo" else plan.hyperparameters["n_envs"]
+        model.learn(plan.steps, callback=supervisor, log_interval=log_interval)
+        if supervisor.stopped:
+            raise StoppedError(model.num_timesteps, supervisor.save_checkpoint())
+        seconds = time.perf_counter() - supervisor.started
+        supervisor.evaluate()
+        logger.dump(model.num_timesteps)
+        supervisor.save_checkpoint()
+        model.policy.load_state_dict(supervisor.best_weights)
+        actor = dataclasses.replace(
+            supervisor.actor(), metadata={**supervisor.actor().metadata, "steps": supervisor.best["steps"]}
+        )
+        actor.save(partial / runs.NETWORK)
+        logger.close()
+        config |= {"steps": model.num_timesteps, "seconds": round(seconds, 3), "best": supervisor.best}
+        runs.finish(folder, config, force=force)
+        return Result(folder, actor, model.num_timesteps, seconds, supervisor.best, supervisor.table())
+    finally:
+        if supervisor is not None:
+            supervisor.bar.close()
+        if logger is not None:
+            logger.close()
+        envs.close()
+        torch.set_num_threads(threads)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of all that a result depends on."""
+    return {
+        "python": platform.python_version(),
+        "sd_friction_env": sd_friction_env.__version__,
+        "gymnasium": gym.__version__,
+        "numpy": np.__version__,
+        "torch": str(torch.__version__),
+        "stable_baselines3": stable_baselines3.__version__,
+        "sb3_contrib": sb3_contrib.__version__,
+    }

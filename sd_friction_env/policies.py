@@ -1,0 +1,422 @@
+"""Controllers that need NumPy alone: constant actions, classical feedback, and trained networks read from .npz files.
+
+All share one method, that of Stable-Baselines3's policies::
+
+    action, state = policy.predict(observation, state, episode_start, deterministic=True)
+
+``observation`` is what the environment returns, shape (d,), or a batch of them, shape (n, d); ``action`` is float32 of
+shape (1,) or (n, 1), in [-1, 1]. ``state`` is what the policy remembers: None before the first step, then what the last
+call returned. ``episode_start``, shape (n,) or a bool, tells where an episode has just begun and memory is cleared.
+"""
+
+import dataclasses
+import json
+import os
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sd_friction_env.orbits import equilibria
+from sd_friction_env.parameters import checked_number
+from sd_friction_env.tables import atomic_file
+
+Actions = NDArray[np.float32]
+State = tuple[NDArray[np.float32], ...] | None
+
+NETWORK_FORMAT = 1
+_NETWORK_KIND = "sd_friction_env network policy"
+_LARGEST_GAIN = 1e6
+
+_ACTIVATIONS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    "Tanh": np.tanh,
+    "ReLU": lambda z: np.maximum(z, 0.0),
+}
+# What stands between the last layer and the action.
+_OUTPUTS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    "clip": lambda z: np.clip(z, -1.0, 1.0),
+    "tanh": np.tanh,
+}
+ACTIVATIONS = tuple(_ACTIVATIONS)
+OUTPUTS = tuple(_OUTPUTS)
+
+
+class Policy(Protocol):
+    """What every controller offers; see the module."""
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, State]:
+        """Return the actions for one observation or a batch of them, and what to remember."""
+
+
+class PolicyFileError(ValueError):
+    """A file is not a policy that can be read here."""
+
+
+# Without feedback -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ConstantPolicy:
+    """Always the same action.
+
+    Attributes:
+        value: the action, in [-1, 1].
+
+    Raises:
+        TypeError, ValueError: if it is not.
+    """
+
+    value: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", checked_number("value", self.value, -1.0, 1.0))
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, State]:
+        """Return the constant for every observation; see the module."""
+        return np.full((*np.shape(observation)[:-1], 1), self.value, np.float32), None
+
+
+class ZeroPolicy(ConstantPolicy):
+    """No action at all: the passive oscillator."""
+
+    def __init__(self) -> None:
+        super().__init__(0.0)
+
+
+# Classical feedback ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Readings:
+    """How the observations of an environment are turned back into physical quantities (dimensionless).
+
+    Attributes:
+        actuator: "force" or "belt_speed".
+        authority: what an action of 1 asks for: a force, or a change of the belt's speed.
+        x_offset, x_scale, v_scale: of the observations, as in :class:`Task`.
+        x_equilibrium: where the mass stands still on the sliding belt of the nominal plant.
+        sees_velocity: whether the observation has the velocity (sensor "state").
+    """
+
+    actuator: str
+    authority: float
+    x_offset: float
+    x_scale: float
+    v_scale: float
+    x_equilibrium: float
+    sees_velocity: bool
+
+    @classmethod
+    def from_env(cls, env: Any) -> Self:
+        """Return the readings of an :class:`SDFrictionEnv`, wrapped or not: its nominal plant, never an episode's own.
+
+        Raises:
+            TypeError: if it is another kind of environment.
+            ValueError: if its actuator has no authority.
+        """
+        bare = getattr(env, "unwrapped", None)
+        task, nominal = getattr(bare, "task", None), getattr(bare, "nominal", None)
+        if task is None or nominal is None:
+            raise TypeError(f"env must be an SDFrictionEnv, got {env!r}")
+        by_force = task.actuator == "force"
+        authority = task.force_limit if by_force else task.belt_authority * nominal.belt_speed
+        if not authority > 0.0:
+            name = "force_limit" if by_force else "belt_authority"
+            raise ValueError(f"feedback needs {name} > 0, got {getattr(task, name)!r}")
+        places = [place.x for place in equilibria(nominal)]
+        return cls(
+            actuator=task.actuator,
+            authority=authority,
+            x_offset=task.x_offset,
+            x_scale=task.x_scale,
+            v_scale=task.v_scale,
+            x_equilibrium=min(places, key=lambda x: abs(x - task.x_offset)) if places else task.x_offset,
+            sees_velocity=task.sensor == "state",
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What :meth:`read` returns, in order."""
+        belt = ("belt modulation",) if self.sees_velocity and self.actuator == "belt_speed" else ()
+        return ("x - x_equilibrium", *(("v",) if self.sees_velocity else ()), *belt)
+
+    def read(self, observation: ArrayLike) -> NDArray[np.float64]:
+        """Return what :attr:`names` says, shape (..., k), without any shown parameters; the belt modulation is
+        (v_belt/belt_speed - 1)/belt_authority.
+
+        Raises:
+            ValueError: if the observations are too short.
+        """
+        values = np.asarray(observation, dtype=np.float64)
+        size = len(self.names)
+        if values.ndim < 1 or values.shape[-1] < size:
+            raise ValueError(f"observation must have at least {size} entries ({', '.join(self.names)})")
+        values = values[..., :size].copy()
+        values[..., 0] = values[..., 0] * self.x_scale + (self.x_offset - self.x_equilibrium)
+        if self.sees_velocity:
+            values[..., 1] *= self.v_scale
+        return values
+
+
+@dataclass(frozen=True)
+class LinearFeedback:
+    """Saturated linear feedback: action = gains . (x - x_equilibrium, v, belt modulation), clipped to [-1, 1].
+
+    Attributes:
+        gains: action per unit of each quantity in ``readings.names``, each in [-1e6, 1e6].
+        readings: of the environment to be controlled.
+
+    Raises:
+        TypeError, ValueError: if there is not one such gain for each quantity observed.
+    """
+
+    gains: tuple[float, ...]
+    readings: Readings
+
+    def __post_init__(self) -> None:
+        names = self.readings.names
+        if len(self.gains) != len(names):
+            raise ValueError(f"gains must be {len(names)} numbers, for {', '.join(names)}; got {self.gains!r}")
+        limit = _LARGEST_GAIN
+        gains = tuple(
+            checked_number(f"gain for {name}", gain, -limit, limit)
+            for name, gain in zip(names, self.gains, strict=True)
+        )
+        object.__setattr__(self, "gains", gains)
+
+    @classmethod
+    def from_env(cls, env: Any, gains: Sequence[float]) -> Self:
+        """Return the controller of an environment; see :class:`Readings`."""
+        return cls(tuple(gains), Readings.from_env(env))
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, State]:
+        """Return the saturated feedback; see the module."""
+        values = self.readings.read(observation)
+        action = np.zeros(values.shape[:-1])
+        # Summed one by one: a product of matrices may round differently for another size of the batch.
+        for i, gain in enumerate(self.gains):
+            action += gain * values[..., i]
+        return np.clip(action, -1.0, 1.0).astype(np.float32)[..., None], None
+
+
+@dataclass(frozen=True)
+class VelocityFeedback:
+    """Saturated velocity feedback: the force u = -gain v, or a belt that follows the mass (belt_speed + gain v).
+
+    Attributes:
+        gain: in [-1e6, 1e6]; force per velocity, or change of belt speed per velocity.
+        readings: of the environment to be controlled.
+
+    Raises:
+        TypeError, ValueError: if the gain is not such a number, or the velocity is not observed.
+    """
+
+    gain: float
+    readings: Readings
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "gain", checked_number("gain", self.gain, -_LARGEST_GAIN, _LARGEST_GAIN))
+        if not self.readings.sees_velocity:
+            raise ValueError(
+                "velocity feedback needs the velocity, and this environment's sensor sees the position only"
+            )
+
+    @classmethod
+    def from_env(cls, env: Any, gain: float) -> Self:
+        """Return the controller of an environment; see :class:`Readings`."""
+        return cls(gain, Readings.from_env(env))
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, State]:
+        """Return the saturated feedback; see the module."""
+        sign = -1.0 if self.readings.actuator == "force" else 1.0
+        action = (sign * self.gain / self.readings.authority) * self.readings.read(observation)[..., 1]
+        return np.clip(action, -1.0, 1.0).astype(np.float32)[..., None], None
+
+
+# Networks -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkPolicy:
+    """A trained network's deterministic action, with its window of past observations if it has one.
+
+    Computed in double precision: the size of a batch, and the library that multiplies the matrices, then hardly ever
+    show in the float32 action.
+
+    Attributes:
+        layers: pairs of a weight matrix, shape (inputs, outputs), and a bias, shape (outputs,), first layer first.
+        activation: between layers, one of "Tanh", "ReLU".
+        output: after the last layer, "clip" or "tanh".
+        frames: observations seen at once, oldest first, zeros where the episode is younger than that.
+        metadata: what the file says of its origin (JSON values), such as ``env_id``.
+
+    Raises:
+        ValueError: if shapes or names do not fit.
+    """
+
+    layers: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]
+    activation: str = "Tanh"
+    output: str = "clip"
+    frames: int = 1
+    metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.activation not in _ACTIVATIONS:
+            raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r}")
+        if self.output not in _OUTPUTS:
+            raise ValueError(f"output must be one of {', '.join(OUTPUTS)}, got {self.output!r}")
+        if not self.layers:
+            raise ValueError("layers must not be empty")
+        layers = tuple((np.asarray(w, np.float64), np.asarray(b, np.float64)) for w, b in self.layers)
+        size: int | None = None
+        for number, (weights, bias) in enumerate(layers):
+            fits = weights.ndim == 2 and bias.shape == weights.shape[1:] and size in (None, weights.shape[0])
+            if not fits:
+                raise ValueError(
+                    f"layer {number}: weights {weights.shape} and bias {bias.shape} do not fit {size} inputs"
+                )
+            if not (np.isfinite(weights).all() and np.isfinite(bias).all()):
+                raise ValueError(f"layer {number} has weights that are not finite")
+            size = weights.shape[1]
+        if size != 1:
+            raise ValueError(f"the last layer must have 1 output, got {size}")
+        inputs = layers[0][0].shape[0]
+        if self.frames < 1 or inputs % self.frames:
+            raise ValueError(f"{inputs} inputs cannot be {self.frames} observations")
+        object.__setattr__(self, "layers", layers)
+
+    @property
+    def observation_size(self) -> int:
+        """Entries of one observation."""
+        return int(self.layers[0][0].shape[0]) // self.frames
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, State]:
+        """Return the network's actions and the window of observations; see the module.
+
+        Raises:
+            ValueError: if the observations have another size, or ``deterministic`` is False.
+        """
+        if not deterministic:
+            raise ValueError("deterministic must be True: a network file holds the deterministic action alone")
+        values = np.asarray(observation, dtype=np.float32)
+        if values.ndim not in (1, 2) or values.shape[-1] != self.observation_size:
+            raise ValueError(
+                f"observation must have shape ({self.observation_size},) or (n, {self.observation_size}), "
+                f"got {values.shape}"
+            )
+        single = values.ndim == 1
+        batch = values[None] if single else values
+        if self.frames > 1:
+            batch = self._window(batch, state, episode_start)
+            state = (batch,)
+        activation = _ACTIVATIONS[self.activation]
+        hidden = batch.astype(np.float64)
+        for weights, bias in self.layers[:-1]:
+            hidden = activation(hidden @ weights + bias)
+        weights, bias = self.layers[-1]
+        action = _OUTPUTS[self.output](hidden @ weights + bias).astype(np.float32)
+        return (action[0] if single else action), state
+
+    def _window(self, batch: NDArray[np.float32], state: State, episode_start: ArrayLike | None) -> NDArray[np.float32]:
+        size = self.observation_size
+        window = np.zeros((len(batch), self.frames * size), np.float32)
+        if state is not None:
+            if len(state) != 1 or state[0].shape != window.shape:
+                raise ValueError(f"state must be what the last call returned, for a batch of {len(batch)}")
+            window[:, :-size] = state[0][:, size:]
+            if episode_start is not None:
+                window[np.broadcast_to(np.asarray(episode_start, dtype=bool), (len(batch),))] = 0.0
+        window[:, -size:] = batch
+        return window
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the policy as an .npz file, whole or not at all (weights in float32, as they were trained).
+
+        Raises:
+            ValueError: if the name does not end in .npz. OSError: if the file cannot be written.
+        """
+        target = Path(path)
+        if target.suffix != ".npz":
+            raise ValueError(f"path must end in .npz, got {os.fspath(path)!r}")
+        header = {
+            "kind": _NETWORK_KIND,
+            "format": NETWORK_FORMAT,
+            "activation": self.activation,
+            "output": self.output,
+            "frames": self.frames,
+            "layers": len(self.layers),
+            "metadata": dict(self.metadata),
+        }
+        arrays: dict[str, Any] = {"header": np.array(json.dumps(header))}
+        for i, (weights, bias) in enumerate(self.layers):
+            arrays[f"weights_{i}"] = weights.astype(np.float32)
+            arrays[f"bias_{i}"] = bias.astype(np.float32)
+        with atomic_file(target, "wb") as file:
+            np.savez(file, **arrays)
+
+
+def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
+    """Return the policy in an .npz file that :meth:`NetworkPolicy.save` wrote; nothing in the file is ever executed.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        PolicyFileError: if it is something else, or of a newer format.
+    """
+    name = os.fspath(path)
+    target = Path(path)
+    if target.is_dir():
+        raise PolicyFileError(f"{name!r} is a folder; name the policy.npz in it")
+    if not target.exists():
+        raise FileNotFoundError(f"there is no policy file {name!r}")
+    try:
+        # Opened here, for np.load leaves a file that it refuses open.
+        with open(target, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            header = json.loads(str(archive["header"]))
+            if not isinstance(header, dict) or header.get("kind") != _NETWORK_KIND:
+                raise PolicyFileError(f"{name!r} is not a policy of sd_friction_env")
+            if header["format"] != NETWORK_FORMAT:
+                raise PolicyFileError(
+                    f"{name!r} has policy format {header['format']!r}; this version reads {NETWORK_FORMAT}"
+                )
+            layers = tuple((archive[f"weights_{i}"], archive[f"bias_{i}"]) for i in range(int(header["layers"])))
+            return NetworkPolicy(
+                layers, header["activation"], header["output"], int(header["frames"]), header["metadata"]
+            )
+    except PolicyFileError:
+        raise
+    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise PolicyFileError(f"{name!r} is not a policy of sd_friction_env, or is damaged: {error}") from None

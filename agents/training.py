@@ -374,7 +374,7 @@ def make_plan(
     envs: int | None = None,
     seed: int = 0,
     eval_freq: int | None = None,
-    eval_episodes: int = 20,
+    eval_episodes: int = 50,
     device: str = "cpu",
     threads: int = 1,
 ) -> Plan:

@@ -75,7 +75,7 @@ def make_parser() -> Parser:
     out.add_argument(
         "--eval-freq", type=int, metavar="N", help="steps between evaluations (default: a twentieth of all)"
     )
-    out.add_argument("--eval-episodes", type=int, default=20, metavar="N", help="of each evaluation (default: 20)")
+    out.add_argument("--eval-episodes", type=int, default=50, metavar="N", help="of each evaluation (default: 50)")
     out.add_argument("--no-progress", action="store_true", help="no progress bar")
     return parser
 

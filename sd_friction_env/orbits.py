@@ -124,11 +124,9 @@ def balance_points(parameters: OscillatorParameters, load: float, coefficient: f
             load - coefficient * (g1 - alpha + 1.0),
         ]
     else:
-        # (x - c) s = x + m alpha with s = sqrt(x^2 + alpha^2); squared, a quartic with foreign roots among its own
-        c = coefficient * (g1 - alpha) - load
-        left = np.polymul(np.polymul([1.0, -c], [1.0, -c]), [1.0, 0.0, alpha * alpha])
-        right = np.polymul([1.0, coefficient * alpha], [1.0, coefficient * alpha])
-        polynomial = list(np.polysub(left, right))
+        # (x - c) s = x + d with s = sqrt(x^2 + alpha^2); squared, a quartic with foreign roots among its own
+        c, d, square = coefficient * (g1 - alpha) - load, coefficient * alpha, alpha * alpha
+        polynomial = [1.0, -2.0 * c, c * c + square - 1.0, -2.0 * (c * square + d), c * c * square - d * d]
     plant = parameters.plant
     points: list[float] = []
     for root in np.roots(polynomial).tolist():

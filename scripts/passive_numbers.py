@@ -182,6 +182,13 @@ def curves(report: Report) -> None:
                 report.below(f"{geometry} {alpha}: {name}", gap, 1e-7)
             for note in notes:
                 print(f"    {note}")
+    report.head("Critical belt speeds against the oracle's own search, relative")
+    for geometry in PANELS:
+        for alpha in ALPHAS:
+            p = NOMINAL.replace(geometry=geometry, alpha=alpha)
+            v_b0, v_b1 = critical_belt_speeds(p)
+            report.below(f"{geometry} {alpha}: v_b0", abs(v_b0 / oracle.grazing(p) - 1.0), 1e-7)
+            report.below(f"{geometry} {alpha}: v_b1", abs(v_b1 / oracle.hopf(p) - 1.0), 1e-7)
 
 
 def million_starts(report: Report) -> None:

@@ -9,11 +9,11 @@ import cmath
 import contextlib
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
 
 from sd_friction_env import kernel
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_number
@@ -229,6 +229,13 @@ def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | Non
     raise OrbitError(f"the motion from x = {x!r}, v = {v!r} does not settle; {parameters}")
 
 
+def root(function: Callable[[float], float], low: float, high: float) -> float:
+    """Return where a function changes sign between two arguments (Brent's method)."""
+    from scipy.optimize import brentq  # not at the top: environments start without it
+
+    return float(brentq(function, low, high, xtol=1e-15, rtol=1e-14))
+
+
 class ReturnMap:
     """The map from one maximum of x to the next in slip, by the radius: the distance of the maximum from a centre.
 
@@ -259,7 +266,7 @@ class ReturnMap:
 
     def root(self, low: float, high: float) -> float:
         """Return the radius of the cycle between two radii whose shifts differ in sign."""
-        return float(brentq(self.shift, low, high, xtol=1e-15, rtol=1e-14))
+        return root(self.shift, low, high)
 
     def cycles(self) -> tuple[list[float], float]:
         """Return the radii of all cycles, ascending, and the largest radius with a lap.
@@ -279,6 +286,8 @@ class ReturnMap:
         if beyond:
             last = self.edge(samples[-1][0], beyond[0])
             samples.append((last, self.shift(last)))
+        from scipy.optimize import minimize_scalar
+
         radii = [self.root(r0, r1) for (r0, s0), (r1, s1) in itertools.pairwise(samples) if s0 * s1 < 0.0]
         for (r0, s0), (_, s1), (r2, s2) in zip(samples, samples[1:], samples[2:], strict=False):
             if s0 * s1 > 0.0 and s1 * s2 > 0.0 and abs(s1) < min(abs(s0), abs(s2)):
@@ -479,7 +488,7 @@ def hopf_belt_speed(parameters: OscillatorParameters) -> float:
     high = parameters.v_m  # friction rises with speed from here on
     for low in np.linspace(high, 0.0, 65)[1:]:
         if damping(float(low)) < 0.0:
-            return float(brentq(damping, low, high, xtol=1e-14, rtol=1e-14)) if damping(high) > 0.0 else high
+            return root(damping, float(low), high) if damping(high) > 0.0 else high
         high = float(low)
     return math.nan
 

@@ -41,9 +41,11 @@ EVENT_NAMES = {
 
 FORCE, BELT_SPEED = 0, 1
 
-TOLERANCE = 1e-10  # estimated error per unit time, relative to max(1, |x|, |v|); the estimate can be ten times too low
+# Estimated error per unit of time, relative to max(1, |x|, |v|, STIFF |x''|); the estimate can be ten times too low.
+TOLERANCE = 1e-10
 MAX_SLIP_STEP = 0.125
-MIN_SLIP_STEP = 1e-12
+MIN_SLIP_STEP = 1e-16
+STIFF = 1e-4  # where friction is so steep that v changes by |a| h, no estimate gets below 1e-14 of that change
 MAX_EVENTS = 256  # in one call of advance
 V_REL_ZERO = 1e-14  # relative velocities this small cannot be told from zero after one step's rounding
 TIME_ZERO = 1e-13  # events are located this closely in time
@@ -451,7 +453,7 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
         h = min(h, remaining)
         belt = v_belt + a_belt * t
         x_end, v_end, a, a_end, error, dv2, dfv = slip_step(plant, mode, x, v, belt, a_belt * h, u, h)
-        allowed = TOLERANCE * h * max(1.0, abs(x), abs(v))
+        allowed = TOLERANCE * h * max(1.0, abs(x), abs(v), STIFF * abs(a))
         if not error <= allowed:  # "not" lets a NaN shrink the step too
             h = 0.5 * h
             if h < MIN_SLIP_STEP:

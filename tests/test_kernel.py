@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sd_friction_env import kernel
-from sd_friction_env.parameters import OscillatorParameters
+from sd_friction_env.parameters import RANGES, STATE_LIMIT, OscillatorParameters
 
 EXACT = OscillatorParameters().plant
 CUBIC = OscillatorParameters(geometry="cubic").plant
@@ -79,6 +79,22 @@ def test_the_estimate_does_not_promise_more_than_a_step_keeps():
         for _ in range(8):
             fine = kernel.slip_step(plant, -1, *fine, 0.2, 0.0, 0.0, h / 8)[:2]
         assert max(abs(x_end - fine[0]), abs(v_end - fine[1])) <= 1e-9 * h + 2e-15
+
+
+def test_no_corner_of_what_is_accepted_defeats_the_error_rule():
+    rng = np.random.default_rng(0)
+    corners = {name: ends for name, ends in RANGES.items() if not name.endswith("scale")}
+    for _ in range(1500):
+        values = {}
+        for name, (low, high) in corners.items():
+            spread = math.exp(rng.uniform(math.log(max(low, 1e-4)), math.log(high)))
+            values[name] = float(rng.choice([low, high, spread, spread]).clip(low, high))
+        values["mu_m"] = min(values["mu_m"], values["mu_s"])
+        p = OscillatorParameters(geometry=("exact", "cubic", "linear")[rng.integers(3)], **values)
+        x, v = rng.uniform(-STATE_LIMIT, STATE_LIMIT, 2)
+        out = kernel.advance(p.plant, x, v, p.belt_speed, 0.0, 0.0, 0.1, None)
+        assert out[4] in (kernel.OK, kernel.CONTACT_LOST), (p, x, v)
+        assert np.isfinite(out).all()
 
 
 def test_a_stuck_mass_moves_with_an_accelerating_belt_exactly():
@@ -179,7 +195,7 @@ def test_normal_numbers_have_mean_zero_and_variance_one():
 SCENARIO = """
 import math, struct, sys
 from sd_friction_env import kernel
-from sd_friction_env.parameters import OscillatorParameters as P
+from sd_friction_env.parameters import RANGES, STATE_LIMIT, OscillatorParameters as P
 out = bytearray()
 for i, geometry in enumerate(("exact", "cubic", "linear")):
     p = P(geometry=geometry, alpha=0.5 + 0.15 * i)

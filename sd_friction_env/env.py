@@ -408,7 +408,8 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self.task.sensor_noise > 0.0:
             assert self._key is not None
             x += self.task.sensor_noise * kernel.random_normal(self._key, self._episode, self._steps + 1, 0)
-            v += self.task.sensor_noise * kernel.random_normal(self._key, self._episode, self._steps + 1, 1)
+            if self._full_state:
+                v += self.task.sensor_noise * kernel.random_normal(self._key, self._episode, self._steps + 1, 1)
         self._past.append((x, v))
         return self._past[0]
 

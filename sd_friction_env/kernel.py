@@ -43,7 +43,7 @@ FORCE, BELT_SPEED = 0, 1
 
 # Estimated error per unit of time, relative to max(1, |x|, |v|, STIFF |x''|); the estimate can be ten times too low.
 TOLERANCE = 1e-10
-MAX_SLIP_STEP = 0.125
+MAX_SLIP_STEP = 0.2
 MIN_SLIP_STEP = 1e-16
 STIFF = 1e-4  # where friction is so steep that v changes by |a| h, no estimate gets below 1e-14 of that change
 MAX_EVENTS = 256  # in one call of advance

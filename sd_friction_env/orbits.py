@@ -26,7 +26,7 @@ _SETTLING_LAPS = 8
 _LONG_SETTLING_LAPS = 800
 _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are called the equilibrium
 _EXITS = 64
-_BELT_SPEED_ERROR = 1e-13
+_BELT_SPEED_ERROR = 1e-11  # v_b0 is given this much too low: on the very graze rounding decides whether a cycle sticks
 
 
 class OrbitError(ValueError):
@@ -307,7 +307,7 @@ def _limit_of_slip(
     laps = ReturnMap(parameters, around[0].x, around[-1].x)
     centre = laps.centre
     radius = maximum - centre
-    factor = 1.1 if growing else 0.5
+    factor = 1.2 if growing else 0.5
     while _SMALLEST_RADIUS < radius < 2.0 * STATE_LIMIT:
         following = factor * radius
         change = laps.shift(following)
@@ -539,8 +539,8 @@ def grazing_belt_speed(parameters: OscillatorParameters) -> float:
             inside, outside = float(low), high
             while True:
                 middle = 0.5 * (inside + outside)
-                if outside - inside < _BELT_SPEED_ERROR:
-                    return inside
+                if outside - inside < 0.1 * _BELT_SPEED_ERROR:
+                    return inside - _BELT_SPEED_ERROR
                 if sticks_again(middle):
                     inside = middle
                 else:

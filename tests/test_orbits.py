@@ -186,6 +186,18 @@ def test_a_growing_slip_is_followed_no_further_out_than_it_goes(belt_speed):
     assert history.amplitude(since=350.0) == pytest.approx(cycle.amplitude, rel=1e-4)
 
 
+@pytest.mark.parametrize("ratio", [0.12, 0.15, 0.18, 0.25, 0.3])
+@pytest.mark.parametrize("geometry", ["cubic", "exact", "linear"])
+def test_the_cycle_at_v_b0_itself_is_the_end_of_both_branches(geometry, ratio):
+    parameters = OscillatorParameters(geometry=geometry, mu_m=0.2 - 0.5 * ratio)
+    v_b0 = critical_belt_speeds(parameters).v_b0
+    at, before, after = (
+        limit_cycle(parameters.replace(belt_speed=speed)).amplitude for speed in (v_b0, v_b0 - 1e-8, v_b0 + 1e-8)
+    )
+    assert at == pytest.approx(before, rel=1e-6)
+    assert at == pytest.approx(after, rel=1e-6)
+
+
 def test_an_overdamped_mass_creeps_to_its_equilibrium_and_is_not_followed_for_ever():
     p = NOMINAL.replace(beta=3.0, mu_m=0.2)
     cycle = limit_cycle(p, 0.5, -1.0)

@@ -1,6 +1,7 @@
 """What the figure scripts share: the two geometries, the table's header, and computing apart from drawing."""
 
 import argparse
+import functools
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -17,14 +18,19 @@ from sd_friction_env.parameters import Geometry
 PANELS: dict[Geometry, str] = {"cubic": "as published (cubic, Eq. 9)", "exact": "exact (Eq. 4)"}
 
 
-def metadata(parameters: Iterable[OscillatorParameters]) -> dict[str, str]:
-    """Return a table's header: versions, commit and parameters."""
+@functools.cache
+def commit() -> str:
+    """Return what git calls the working tree, "unknown" outside of a checkout."""
     git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
     try:
-        commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
-        commit = "unknown"
-    header = {"sd_friction_env": sd_friction_env.__version__, "numpy": np.__version__, "commit": commit}
+        return "unknown"
+
+
+def metadata(parameters: Iterable[OscillatorParameters]) -> dict[str, str]:
+    """Return a table's header: versions, commit and parameters."""
+    header = {"sd_friction_env": sd_friction_env.__version__, "numpy": np.__version__, "commit": commit()}
     return header | {f"parameters {i}": str(p) for i, p in enumerate(parameters, start=1)}
 
 

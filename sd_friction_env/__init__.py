@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out f
     from sd_friction_env.simulation import Trajectory, simulate
     from sd_friction_env.tables import Table
     from sd_friction_env.task import Task
+    from sd_friction_env.vector_env import SDFrictionVectorEnv
 
 __version__ = "0.1.0"
 
@@ -56,6 +57,7 @@ _PUBLIC = {
     "Task": "task",
     "SDFrictionEnv": "env",
     "EnvState": "env",
+    "SDFrictionVectorEnv": "vector_env",
 }
 __all__ = [
     "ENVIRONMENT_IDS",
@@ -67,6 +69,7 @@ __all__ = [
     "OrbitError",
     "OscillatorParameters",
     "SDFrictionEnv",
+    "SDFrictionVectorEnv",
     "Table",
     "Task",
     "Trajectory",
@@ -98,6 +101,7 @@ for _name, _actuator in _ACTUATORS.items():
         register(
             id=f"SDFriction/{_name}{_tier}-v0",
             entry_point="sd_friction_env.env:SDFrictionEnv",
+            vector_entry_point="sd_friction_env.vector_env:SDFrictionVectorEnv",
             kwargs={"actuator": _actuator, **_arguments},
         )
 

@@ -20,9 +20,19 @@ from sd_friction_env.task import Task, rig_arguments
 
 RewardFunction = Callable[[Mapping[str, Any]], float]
 
-_ACTUATOR_CODES = {"force": kernel.FORCE, "belt_speed": kernel.BELT_SPEED}
-_OPTIONS = ("parameters", "phase", "start", "v", "x")
-_READOUT_INTERVALS = 100  # the window of the rendered amplitude and stick readouts
+ACTUATOR_CODES = {"force": kernel.FORCE, "belt_speed": kernel.BELT_SPEED}
+OPTIONS = ("parameters", "phase", "start", "v", "x")
+EPISODE_STATISTICS = (
+    "return",
+    "length",
+    "late_amplitude",
+    "late_stick_fraction",
+    "reward_vibration",
+    "reward_effort",
+    "reward_stick",
+    "reward_contact_loss",
+)
+READOUT_INTERVALS = 100  # the window of the rendered amplitude and stick readouts
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,6 +92,10 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     episode's nominal one. The terms stand in `info` as `reward_vibration`, `reward_effort`, `reward_stick` and
     `reward_contact_loss`; `reward`, a function of that dictionary, replaces their sum.
 
+    With an episode's last step `info["statistics"]` holds its `return`, its `length`, `late_amplitude` and
+    `late_stick_fraction` (over the last quarter of the time an episode has; NaN if it did not come so far) and the sums
+    of the four terms.
+
     ## Starting State
 
     `start`: a random phase of the passive limit cycle (`cycle`), the unloaded spring's place of rest (`rest`) or a
@@ -127,16 +141,18 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         reward: RewardFunction | None = None,
         **task_arguments: Any,
     ) -> None:
-        self.nominal = _as_parameters(parameters)
-        _check_belt(self.nominal)
+        self.nominal = as_parameters(parameters)
+        check_belt(self.nominal)
         task = Task.from_arguments(task_arguments)
         if render_mode is not None:
             checked_choice("render_mode", render_mode, tuple(self.metadata["render_modes"]))
         if reward is not None and not callable(reward):
             raise TypeError(f"reward must be a function of the info dictionary or None, got {reward!r}")
-        if task.randomise:  # the corners must be legal before an episode draws them
-            for corner in (0, 1):
-                _check_belt(self.nominal.replace(**{name: ends[corner] for name, ends in task.randomise.items()}))
+        if task.randomise:  # whatever an episode may draw must be legal
+            corner = {name: low for name, (low, _) in task.randomise.items()}
+            if "mu_m" in corner:
+                corner["mu_m"] = task.randomise["mu_m"][1]  # the greatest, beside the least mu_s
+            check_belt(self.nominal.replace(**corner))
         self.render_mode = render_mode
         self.reward = reward
         with announced("orbits"):
@@ -156,7 +172,8 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._ended = False
         self._worst_cost = 0.0
         self._past: collections.deque[tuple[float, float]] = collections.deque(maxlen=task.sensor_delay + 1)
-        self._window: collections.deque[tuple[float, float, float]] = collections.deque(maxlen=_READOUT_INTERVALS)
+        self._window: collections.deque[tuple[float, float, float]] = collections.deque(maxlen=READOUT_INTERVALS)
+        self._log: list[tuple[float, ...]] = []
         self._x = self._v = self._v_belt = self._belt_travel = 0.0
         self._mode = kernel.STICK
         self._force = 0.0
@@ -209,12 +226,11 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _use(self, parameters: OscillatorParameters) -> None:
         task = self.task
         self._parameters = parameters
-        authority = task.force_limit if task.actuator == "force" else task.belt_authority
         # All that compiled code needs of plant and task, in its order of arguments: floats pass its border cheaply.
         self._constants = (
             *parameters.plant,
-            _ACTUATOR_CODES[task.actuator],
-            authority,
+            ACTUATOR_CODES[task.actuator],
+            task.authority,
             task.belt_acceleration_limit,
             parameters.belt_speed,
             task.control_interval,
@@ -246,7 +262,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Raises:
             TypeError, ValueError: if an option is unknown or out of its range; the running episode is then untouched.
         """
-        options = _checked_options(options)
+        options = checked_options(options)
         key, episode = self._key, self._episode + 1
         if seed is not None or key is None:
             super().reset(seed=seed)
@@ -255,16 +271,9 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         parameters = task.drawn_parameters(self.nominal, key, episode)
         if "parameters" in options:
             parameters = parameters.replace(**options["parameters"])
-            _check_belt(parameters)
-        if "start" in options:
-            task = dataclasses.replace(task, start=options["start"])
+            check_belt(parameters)
         with announced("starts"):
-            if "x" in options:
-                x, v = options["x"], options.get("v", parameters.belt_speed)
-            elif "phase" in options:
-                x, v = task.cycle_state(parameters, options["phase"])
-            else:
-                x, v = task.start_state(parameters, key, episode)
+            x, v = start_of(task, parameters, options, key, episode)
         self._key, self._episode = key, episode
         self._use(parameters)
         self._x, self._v, self._v_belt = x, v, parameters.belt_speed
@@ -275,9 +284,8 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._mode = kernel.mode_of(parameters.plant, x, v, parameters.belt_speed, 0.0, 0.0)
         self._force = 0.0
         self._past.clear()
-        self._window.clear()
-        if self._renderer is not None:
-            self._renderer.clear_trail()
+        self._log.clear()
+        self.clear_picture()
         if self.render_mode == "human":
             self.render()
         return self._observation(), {
@@ -376,10 +384,40 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self.reward is not None:
             reward = float(self.reward(info))
         if self.render_mode is not None:
-            self._window.append((x_min, x_max, stick_fraction))
+            self.note_for_picture(x_min, x_max, stick_fraction, force)
             if self.render_mode == "human":
                 self.render()
+        self._log.append((reward, vibration, effort, stick, contact_loss, x_min, x_max, stick_fraction))
+        if terminated or truncated:
+            info["statistics"] = self._statistics()
         return self._observation(), reward, terminated, truncated, info
+
+    def _statistics(self) -> dict[str, Any]:
+        """Return what the episode came to; "late" is the last quarter of its time."""
+        total = vibration = effort = stick = contact_loss = late_stick = 0.0
+        low, high = math.inf, -math.inf
+        late = 0
+        for steps, row in enumerate(self._log, start=self._steps - len(self._log) + 1):
+            total += row[0]
+            vibration += row[1]
+            effort += row[2]
+            stick += row[3]
+            contact_loss += row[4]
+            if steps > self.task.late_steps:
+                low, high = min(low, row[5]), max(high, row[6])
+                late_stick += row[7]
+                late += 1
+        values = (
+            total,
+            len(self._log),
+            amplitude(low, high) if late else math.nan,
+            late_stick / late if late else math.nan,
+            vibration,
+            effort,
+            stick,
+            contact_loss,
+        )
+        return dict(zip(EPISODE_STATISTICS, values, strict=True))
 
     def _observation(self) -> NDArray[np.float32]:
         x, v = self._x, self._v
@@ -438,6 +476,8 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def set_state(self, state: EnvState) -> None:
         """Go back to a state that :meth:`get_state` returned: what follows is the same, bit for bit.
 
+        The episode's statistics begin anew.
+
         Raises:
             TypeError: if it is not an :class:`EnvState`.
         """
@@ -451,8 +491,30 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._worst_cost = state.worst_cost
         self._key, self._episode = state.key, state.episode
         self._past.clear()
+        self._log.clear()
         self._past.extend(state.past)
         self._mode = kernel.mode_of(state.parameters.plant, state.x, state.v, state.v_belt, 0.0, 0.0)
+
+    def note_for_picture(self, x_min: float, x_max: float, stick_fraction: float, force: float) -> None:
+        """Remember what an interval came to for the readouts of :meth:`render`."""
+        self._window.append((x_min, x_max, stick_fraction))
+        self._force = force
+
+    def clear_picture(self) -> None:
+        """Begin the readouts and the trail of :meth:`render` anew."""
+        self._window.clear()
+        self._force = 0.0
+        if self._renderer is not None:
+            self._renderer.clear_trail()
+
+    def twin(self) -> Self:
+        """Return an environment of the same kind that draws in a picture of its own."""
+        return type(self)(
+            self.nominal,
+            render_mode=self.render_mode,
+            reward=self.reward,
+            **{name: getattr(self.task, name) for name in Task.field_names()},
+        )
 
     def render(self) -> Any:
         """Draw the present state; an array of shape (height, width, 3), uint8, in mode "rgb_array"."""
@@ -495,7 +557,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer = None
 
 
-def _as_parameters(parameters: Any) -> OscillatorParameters:
+def as_parameters(parameters: Any) -> OscillatorParameters:
     if parameters is None:
         return OscillatorParameters()
     if isinstance(parameters, OscillatorParameters):
@@ -505,12 +567,25 @@ def _as_parameters(parameters: Any) -> OscillatorParameters:
     raise TypeError(f"parameters must be OscillatorParameters or a mapping of its fields, got {parameters!r}")
 
 
-def _check_belt(parameters: OscillatorParameters) -> None:
+def check_belt(parameters: OscillatorParameters) -> None:
     if parameters.belt_speed <= 0.0:
         raise ValueError(
             f"belt_speed must be positive in an environment (its reward is measured against it), "
             f"got {parameters.belt_speed!r}"
         )
+
+
+def start_of(
+    task: Task, parameters: OscillatorParameters, options: Mapping[str, Any], key: int, episode: int
+) -> tuple[float, float]:
+    """Return the (x, v) at which an episode starts that is reset with (checked) options."""
+    if "x" in options:
+        return options["x"], options.get("v", parameters.belt_speed)
+    if "phase" in options:
+        return task.cycle_state(parameters, options["phase"])
+    if "start" in options:
+        task = dataclasses.replace(task, start=options["start"])
+    return task.start_state(parameters, key, episode)
 
 
 def _clipped_action(action: Any) -> float:
@@ -527,14 +602,14 @@ def _clipped_action(action: Any) -> float:
     return float(min(max(array[0], -1.0), 1.0))
 
 
-def _checked_options(options: Any) -> dict[str, Any]:
+def checked_options(options: Any) -> dict[str, Any]:
     if options is None:
         return {}
     if not isinstance(options, Mapping):
         raise TypeError(f"options must be a mapping or None, got {options!r}")
-    unknown = sorted(str(name) for name in options if name not in _OPTIONS)
+    unknown = sorted(str(name) for name in options if name not in OPTIONS)
     if unknown:
-        raise ValueError(f"unknown option {unknown[0]!r}; allowed: {', '.join(_OPTIONS)}")
+        raise ValueError(f"unknown option {unknown[0]!r}; allowed: {', '.join(OPTIONS)}")
     checked = dict(options)
     if "parameters" in checked:
         given = checked["parameters"]

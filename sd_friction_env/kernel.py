@@ -17,8 +17,12 @@ import math
 from typing import NamedTuple
 
 import numba
+import numpy as np
 
 compiled = numba.njit(cache=True, error_model="numpy", nogil=True)
+# For what stands in a loop over lanes: only without a call left in it does such a loop become vector instructions.
+in_threads = numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+in_lanes = numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 
 EXACT, CUBIC, LINEAR = 0, 1, 2
 
@@ -47,8 +51,10 @@ MAX_SLIP_STEP = 0.2
 MIN_SLIP_STEP = 1e-16
 STIFF = 1e-4  # where friction is so steep that v changes by |a| h, no estimate gets below 1e-14 of that change
 MAX_EVENTS = 256  # in one call of advance
+NOTHING_KNOWN = (0.0,) * 18  # of a slip that begins
 V_REL_ZERO = 1e-14  # relative velocities this small cannot be told from zero after one step's rounding
 TIME_ZERO = 1e-13  # events are located this closely in time
+LAST_STRETCH = 1e-5  # of a step: a Taylor step of this length is exact to rounding
 STEP_DOUBLING = 1.0 / 1024.0  # a step this far inside the rule doubles: the error falls as h^8, four times the margin
 
 
@@ -259,8 +265,7 @@ _E3_11 = 0.20136540080403034
 _E3_12 = 0.02265179219836082
 
 
-@compiled
-def slip_step(plant, mode, x, v, v_belt, dv_belt, u, h):
+def _slip_step(plant, mode, x, v, v_belt, dv_belt, u, h):
     """Take one step of length h in slip, over which the belt speed grows linearly by dv_belt.
 
     Return x, v, the acceleration at the start and (to a few digits fewer) at the end, the error estimate, and the
@@ -358,6 +363,9 @@ def slip_step(plant, mode, x, v, v_belt, dv_belt, u, h):
     return x_end, v_end, a1, a12, error, int_v2, int_fv
 
 
+slip_step = compiled(_slip_step)
+
+
 # Events in slip -----------------------------------------------------------------------------------------------------
 
 
@@ -372,49 +380,127 @@ def _dips(gap, slope, gap_end, slope_end, h):
 
 
 @compiled
-def _bottom_time(plant, mode, x, v, v_belt, a_belt, u, h, side, rate):
-    """Return the time in (0, h) at which side (v - rate t) is least, where its slope changes sign once."""
-    low = 0.0
-    high = h
-    for _ in range(60):
-        t = 0.5 * (low + high)
-        if high - low < TIME_ZERO:
-            break
-        _, _, _, a, _, _, _ = slip_step(plant, mode, x, v, v_belt, a_belt * t, u, t)
-        if side * (a - rate) < 0.0:
-            low = t
-        else:
-            high = t
-    return 0.5 * (low + high)
+def slip_jerk(plant, mode, x, v, v_belt, a_belt, a):
+    """Return the rate of change of the acceleration a in slip, under a held force."""
+    restoring_slope, normal_slope = spring_slopes(plant, x)
+    v_rel = v - v_belt
+    contact = friction_slope(plant, mode, v_rel) * (a - a_belt) * spring(plant, x)[1]
+    contact = contact + friction_coefficient(plant, mode, v_rel) * normal_slope * v
+    return -contact - 2.0 * plant.beta * a - restoring_slope * v
+
+
+@in_lanes
+def _gap_there(plant, mode, x_t, v_t, v_belt, a_belt, u, t, side, level, rate, dv2, dfv):
+    belt = v_belt + a_belt * t
+    a_t, f_t = slip_forces(plant, mode, x_t, v_t, belt, u)
+    gap = side * (v_t - (level + rate * t))
+    curvature = side * slip_jerk(plant, mode, x_t, v_t, belt, a_belt, a_t)
+    return gap, side * (a_t - rate), curvature, x_t, v_t, a_t, f_t, dv2, dfv
 
 
 @compiled
-def _closing_time(plant, mode, x, v, v_belt, a_belt, u, low, high, side, level, rate):
-    """Return the time in (low, high] at which side (v - level - rate t) falls through zero: Newton in a bracket."""
-    t = 0.5 * (low + high)
-    if low == 0.0:
-        start = side * (v - level)
-        _, v_high, _, _, _, _, _ = slip_step(plant, mode, x, v, v_belt, a_belt * high, u, high)
-        end = side * (v_high - level - rate * high)
-        if start > V_REL_ZERO and end < start:
-            t = min(high, high * start / (start - end))
+def _gap_at(plant, mode, x, v, v_belt, a_belt, u, t, side, level, rate):
+    """Slip for a time t; return the gap side (v - level - rate t), its slope and curvature, x, v, a, the contact force
+    and the integrals of v^2 and of that force's power."""
+    x_t, v_t, _, _, _, dv2, dfv = slip_step(plant, mode, x, v, v_belt, a_belt * t, u, t)
+    return _gap_there(plant, mode, x_t, v_t, v_belt, a_belt, u, t, side, level, rate, dv2, dfv)
+
+
+@compiled
+def _dip(plant, mode, x, v, v_belt, a_belt, u, h, side, level, rate, slope, slope_end):
+    """Look for a time in (0, h) at which a gap that falls at 0 and rises at h is below zero: Newton on its slope.
+
+    Return whether there is one, and the time.
+    """
+    low = 0.0
+    high = h
+    t = h * slope / (slope - slope_end)
+    for _ in range(60):
+        gap, slope, curvature, _, _, _, _, _, _ = _gap_at(plant, mode, x, v, v_belt, a_belt, u, t, side, level, rate)
+        if gap < -V_REL_ZERO:
+            return True, t
+        if slope < 0.0:
+            low = t
+        else:
+            high = t
+        dt = -slope / curvature if curvature > 0.0 else h
+        # As far from the bottom as this, a parabola tells how deep it is, with as much again to spare.
+        if abs(dt) < 0.125 * h and gap > abs(slope * dt) + V_REL_ZERO:
+            return False, t
+        if abs(dt) < 1e-9 * h or high - low < TIME_ZERO:
+            break
+        t = t + dt
+        if not low < t < high:
+            t = 0.5 * (low + high)
+    return False, t
+
+
+@compiled
+def _closing_guess(gap, slope, gap_end, slope_end, h):
+    """Return where the cubic with these values and slopes at 0 and h falls through zero, to a few digits."""
+    m0 = slope * h
+    m1 = slope_end * h
+    c2 = 3.0 * (gap_end - gap) - 2.0 * m0 - m1
+    c3 = m0 + m1 - 2.0 * (gap_end - gap)
+    low = 0.0
+    high = 1.0
+    s = gap / (gap - gap_end) if gap > V_REL_ZERO and gap_end < gap else 0.5
+    for _ in range(20):
+        value = gap + s * (m0 + s * (c2 + s * c3))
+        if value > 0.0:
+            low = s
+        else:
+            high = s
+        rate = m0 + s * (2.0 * c2 + 3.0 * s * c3)
+        following = s - value / rate if rate < 0.0 else 0.5 * (low + high)
+        if not low < following < high:
+            following = 0.5 * (low + high)
+        change = abs(following - s)
+        s = following
+        if change < 1e-4:  # Newton: the error is then of the order of its square
+            break
+    return h * s
+
+
+@compiled
+def _closing(plant, mode, x, v, v_belt, a_belt, u, h, t, side, level, rate, looked, look):
+    """Find where in (0, h] the gap side (v - level - rate t) falls through zero: Newton in a bracket, from a guess t.
+
+    If ``looked`` is true, ``look`` is what :func:`_gap_at` gives there.
+
+    Return that time, x, the acceleration, and the integrals of v^2 and of the contact force's power up to it. The last
+    tiny part of the way is a Taylor step.
+    """
+    low = 0.0
+    high = h
     for _ in range(80):
-        _, v_t, _, a_t, _, _, _ = slip_step(plant, mode, x, v, v_belt, a_belt * t, u, t)
-        gap = side * (v_t - level - rate * t)
-        slope = side * (a_t - rate)
+        if not looked:
+            look = _gap_at(plant, mode, x, v, v_belt, a_belt, u, t, side, level, rate)
+        looked = False
+        gap, slope, curvature, x_t, v_t, a_t, f_t, dv2, dfv = look
         if gap > 0.0:
             low = t
         else:
             high = t
-        if high - low < TIME_ZERO:
+        dt = 0.5 * (low + high) - t
+        near = False
+        if slope < 0.0:
+            first = -gap / slope
+            bend = first * curvature / slope
+            # What is left out is of the order of the bend's square and of the third power of dt.
+            near = abs(first) <= LAST_STRETCH * h and bend * bend * abs(first) <= 0.1 * TIME_ZERO
+            following = first - 0.5 * bend * first if near else first
+            if low < t + following < high:
+                dt = following
+            elif near:
+                dt = min(max(t + following, low), high) - t
+        if near or high - low < TIME_ZERO:
             break
-        t_next = t - gap / slope if slope < 0.0 else 0.5 * (low + high)
-        if abs(t_next - t) < TIME_ZERO:
-            break
-        if not low < t_next < high:
-            t_next = 0.5 * (low + high)
-        t = t_next
-    return t
+        t = t + dt
+    dv2 = dv2 + dt * (v_t * (v_t + a_t * dt))
+    f_slope = side * curvature + 2.0 * plant.beta * a_t + spring_slopes(plant, x_t)[0] * v_t
+    dfv = dfv + dt * (f_t * v_t + 0.5 * dt * (f_t * a_t + f_slope * v_t))
+    return t + dt, x_t + dt * (v_t + 0.5 * a_t * dt), a_t, dv2, dfv
 
 
 @compiled
@@ -434,10 +520,13 @@ def _contact_loss_time(plant, mode, x, v, v_belt, a_belt, u, high):
 
 
 @compiled
-def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_turning):
+def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_turning, known):
     """Slip for ``duration``, or until v_rel returns to zero (LANDING), contact is lost (CONTACT_LOSS), v changes
     sign (TURNING, if asked for) or the error rule cannot be met (STUCK_STEP).
 
+    ``known`` are 18 numbers: whether the first step was tried already (0: no, 1: over ``duration``, 2: and the time at
+    which it lands, or else turns, was guessed and looked at), what :func:`slip_step` gave, the time, and what
+    :func:`_gap_at` gave there.
     Return the time spent, x, v, the event, the integrals of v^2 and of the contact force's power, and the least and
     greatest x met. After LANDING v equals the belt speed exactly, after TURNING it is exactly zero.
     """
@@ -448,11 +537,18 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
     int_v2 = 0.0
     int_fv = 0.0
     event = NO_EVENT
+    first = True
     while t < duration:
         remaining = duration - t
         h = min(h, remaining)
         belt = v_belt + a_belt * t
-        x_end, v_end, a, a_end, error, dv2, dfv = slip_step(plant, mode, x, v, belt, a_belt * h, u, h)
+        looked = first and known[0] == 2.0
+        if first and known[0] > 0.0:
+            trial = known[1:8]
+        else:
+            trial = slip_step(plant, mode, x, v, belt, a_belt * h, u, h)
+        first = False
+        x_end, v_end, a, a_end, error, dv2, dfv = trial
         allowed = TOLERANCE * h * max(1.0, abs(x), abs(v), STIFF * abs(a))
         if not error <= allowed:  # "not" lets a NaN shrink the step too
             h = 0.5 * h
@@ -464,37 +560,40 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
 
         gap = mode * (v - belt)
         gap_end = mode * (v_end - (belt + a_belt * h))
+        slope = mode * (a - a_belt)
+        slope_end = mode * (a_end - a_belt)
         if gap > V_REL_ZERO:
             lands = gap_end <= 0.0
         else:  # it has just left the stick surface
             lands = gap_end < -V_REL_ZERO
-        bracket = h
-        if not lands and _dips(gap, mode * (a - a_belt), gap_end, mode * (a_end - a_belt), h):
-            bracket = _bottom_time(plant, mode, x, v, belt, a_belt, u, h, mode, a_belt)
-            _, v_low, _, _, _, _, _ = slip_step(plant, mode, x, v, belt, a_belt * bracket, u, bracket)
-            lands = mode * (v_low - (belt + a_belt * bracket)) < -V_REL_ZERO
+        guess = known[8]
         if lands:
-            length = _closing_time(plant, mode, x, v, belt, a_belt, u, 0.0, bracket, mode, belt, a_belt)
-            x_end, v_end, a, a_end, error, dv2, dfv = slip_step(plant, mode, x, v, belt, a_belt * length, u, length)
+            if not looked:
+                guess = _closing_guess(gap, slope, gap_end, slope_end, h)
+        elif _dips(gap, slope, gap_end, slope_end, h):
+            lands, length = _dip(plant, mode, x, v, belt, a_belt, u, h, mode, belt, a_belt, slope, slope_end)
+            guess = 0.5 * length
+            length = length if lands else h
+        if lands:
+            length, x_end, a_end, dv2, dfv = _closing(
+                plant, mode, x, v, belt, a_belt, u, length, guess, mode, belt, a_belt, looked, known[9:]
+            )
             v_end = belt + a_belt * length
             event = LANDING
 
         turns = False
-        low = 0.0
         bracket = length
+        side = 1 if v > 0.0 else -1
         if v * v_end < 0.0:
             turns = True
-        elif v != 0.0:
-            side = 1 if v > 0.0 else -1
-            if _dips(side * v, side * a, side * v_end, side * a_end, length):
-                bracket = _bottom_time(plant, mode, x, v, belt, a_belt, u, length, side, 0.0)
-                x_low, v_low, _, _, _, _, _ = slip_step(plant, mode, x, v, belt, a_belt * bracket, u, bracket)
-                turns = side * v_low < -V_REL_ZERO
+            if lands or not looked:
+                guess = _closing_guess(side * v, side * a, side * v_end, side * a_end, length)
+        elif v != 0.0 and _dips(side * v, side * a, side * v_end, side * a_end, length):
+            turns, bracket = _dip(plant, mode, x, v, belt, a_belt, u, length, side, 0.0, 0.0, side * a, side * a_end)
+            guess = 0.5 * bracket
         if turns:
-            side = 1 if v > 0.0 else -1
-            t_turn = _closing_time(plant, mode, x, v, belt, a_belt, u, low, bracket, side, 0.0, 0.0)
-            x_turn, v_turn, a_turn, a_turn_end, error_turn, dv2_turn, dfv_turn = slip_step(
-                plant, mode, x, v, belt, a_belt * t_turn, u, t_turn
+            t_turn, x_turn, _, dv2_turn, dfv_turn = _closing(
+                plant, mode, x, v, belt, a_belt, u, bracket, guess, side, 0.0, 0.0, looked and not lands, known[9:]
             )
             x_min = min(x_min, x_turn)
             x_max = max(x_max, x_turn)
@@ -529,7 +628,7 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
 # Stick --------------------------------------------------------------------------------------------------------------
 
 
-@compiled
+@in_lanes
 def _cone_excess(plant, side, x, v_belt, a_belt, u, t):
     """Return by how much a mass stuck since t = 0 at x exceeds one side of the stick cone at time t, and the slope."""
     speed = v_belt + a_belt * t
@@ -538,6 +637,33 @@ def _cone_excess(plant, side, x, v_belt, a_belt, u, t):
     restoring_slope, normal_slope = spring_slopes(plant, x_t)
     load_slope = 2.0 * plant.beta * a_belt + restoring_slope * speed
     return side * load - limit, side * load_slope - plant.mu_s * normal_slope * speed
+
+
+@compiled
+def _breakaway_time(plant, side, x, v_belt, a_belt, u, low, high):
+    """Return a time in (low, high], just outside the cone, at which one side of it is left: Newton in a bracket."""
+    t = high
+    nudge = 1e-16 * max(1.0, high)
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        if middle <= low or middle >= high:
+            break
+        excess, slope = _cone_excess(plant, side, x, v_belt, a_belt, u, t)
+        if excess > 0.0:
+            high = t
+        else:
+            low = t
+        following = t - excess / slope if slope > 0.0 else middle
+        if abs(following - t) < TIME_ZERO:
+            # There, but for rounding: step over the place until it is hemmed in.
+            nudge = 2.0 * nudge
+            if high - low <= 2.0 * nudge:
+                break
+            following = following + nudge if excess <= 0.0 else following - nudge
+        if not low < following < high:
+            following = 0.5 * (low + high)
+        t = following
+    return high
 
 
 @compiled
@@ -575,21 +701,25 @@ def stick_until_event(plant, x, v_belt, a_belt, u, duration):
                         high = middle
                 outside = _cone_excess(plant, side, x, v_belt, a_belt, u, high)[0] > 0.0
             if outside:
-                low = t
-                for _ in range(80):
-                    middle = 0.5 * (low + high)
-                    if middle <= low or middle >= high:
-                        break
-                    if _cone_excess(plant, side, x, v_belt, a_belt, u, middle)[0] > 0.0:
-                        high = middle
-                    else:
-                        low = middle
+                high = _breakaway_time(plant, side, x, v_belt, a_belt, u, t, high)
                 first = min(first, high)
                 found = True
         if found:
             return first, BREAKAWAY
         t = t_end
     return duration, NO_EVENT
+
+
+@in_lanes
+def _ride(plant, x, v_belt, a_belt, u, t):
+    """Return how far a stuck mass rides in a time t, and the integrals of v^2 and of the contact force's power.
+
+    That force is a_belt + 2 beta v_belt + R - u: its power integrates in closed form.
+    """
+    dx = (v_belt + 0.5 * a_belt * t) * t
+    int_v2 = (v_belt * v_belt + a_belt * t * (v_belt + a_belt * t / 3.0)) * t
+    work = (a_belt - u) * dx + 2.0 * plant.beta * int_v2 + potential(plant, x + dx) - potential(plant, x)
+    return dx, int_v2, work
 
 
 # The automaton ------------------------------------------------------------------------------------------------------
@@ -604,6 +734,12 @@ def advance(plant, x, v, v_belt, a_belt, u, duration, events):
     of events, the integral of v^2, the time stuck, the integral of the contact force's power, and the least and
     greatest x met.
     """
+    return _advance(plant, x, v, v_belt, a_belt, u, duration, events, NOTHING_KNOWN)
+
+
+@compiled
+def _advance(plant, x, v, v_belt, a_belt, u, duration, events, known):
+    """:func:`advance`, where ``known`` (see :func:`slip_until_event`) is of the slip it begins with, if it does."""
     t = 0.0
     n_events = 0
     int_v2 = 0.0
@@ -620,10 +756,8 @@ def advance(plant, x, v, v_belt, a_belt, u, duration, events):
         remaining = duration - t
         if mode == STICK:
             dt, event = stick_until_event(plant, x, belt, a_belt, u, remaining)
-            dx = (belt + 0.5 * a_belt * dt) * dt
-            dv2 = (belt * belt + a_belt * dt * (belt + a_belt * dt / 3.0)) * dt
-            # The contact force in stick is a_belt + 2 beta v_belt + R - u; its power integrates in closed form.
-            int_fv += (a_belt - u) * dx + 2.0 * plant.beta * dv2 + potential(plant, x + dx) - potential(plant, x)
+            dx, dv2, dfv = _ride(plant, x, belt, a_belt, u, dt)
+            int_fv += dfv
             int_v2 += dv2
             stick_time += dt
             if belt * (belt + a_belt * dt) < 0.0:  # the belt reverses
@@ -635,8 +769,9 @@ def advance(plant, x, v, v_belt, a_belt, u, duration, events):
             x_max = max(x_max, x)
         else:
             dt, x, v, event, dv2, dfv, low, high = slip_until_event(
-                plant, mode, x, v, belt, a_belt, u, remaining, False
+                plant, mode, x, v, belt, a_belt, u, remaining, False, known
             )
+            known = NOTHING_KNOWN
             int_v2 += dv2
             int_fv += dfv
             x_min = min(x_min, low)
@@ -719,6 +854,7 @@ STICK_PATIENCE = 1e12  # a belt this slow never brings a stuck mass to breakaway
 # Slip that takes longer from one turning point or landing to the next creeps into a node or past a fold.
 SLIP_PATIENCE = 2000.0
 STANDSTILL = 1e-9
+SETTLING_LAPS, SETTLING_EXITS = 8, 64  # before a passive motion that still slips is looked at more closely
 
 
 @compiled
@@ -756,7 +892,9 @@ def settle(plant, v_belt, x, v, turnings, exits):
             maxima = 0
             last_max = math.nan
             continue
-        _, x, v, event, _, _, _, _ = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
+        _, x, v, event, _, _, _, _ = slip_until_event(
+            plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
+        )
         if event == LANDING:
             mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
         elif event == TURNING:
@@ -814,7 +952,9 @@ def stick_slip_lap(plant, v_belt, x_exit):
                 forward_arcs += 1
             v = v_belt
             continue
-        dt, x, v, event, dv2, _, low, high = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, False)
+        dt, x, v, event, dv2, _, low, high = slip_until_event(
+            plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, False, NOTHING_KNOWN
+        )
         t += dt
         int_v2 += dv2
         x_min = min(x_min, low)
@@ -840,11 +980,13 @@ def next_maximum(plant, v_belt, x):
     acceleration, _ = slip_forces(plant, mode, x, 0.0, v_belt, 0.0)
     if mode != SLIP_BACKWARD or acceleration >= 0.0:
         return NO_EVENT, math.nan, math.nan, math.nan, math.nan
-    t, x_low, v, event, int_v2, _, _, _ = slip_until_event(plant, mode, x, 0.0, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
+    t, x_low, v, event, int_v2, _, _, _ = slip_until_event(
+        plant, mode, x, 0.0, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
+    )
     if event != TURNING:
         return event, math.nan, x_low, t, int_v2
     dt, x_high, v, event, dv2, _, _, _ = slip_until_event(
-        plant, mode, x_low, 0.0, v_belt, 0.0, 0.0, SLIP_PATIENCE, True
+        plant, mode, x_low, 0.0, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
     )
     return event, x_high, x_low, t + dt, int_v2 + dv2
 
@@ -857,7 +999,9 @@ def slip_returns_to_stick(plant, v_belt, x):
     mode = SLIP_BACKWARD if load > 0.0 else SLIP_FORWARD
     maxima = 0
     for _ in range(MAX_EVENTS):
-        _, x, v, event, _, _, _, _ = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
+        _, x, v, event, _, _, _, _ = slip_until_event(
+            plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
+        )
         if event == LANDING:
             mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
             if mode == STICK:
@@ -899,7 +1043,9 @@ def classify(plant, v_belt, xs, vs, exits, exit_labels, centres, bounds, bound_l
                         best = abs(exits[i] - x)
                         label = exit_labels[i]
                 break
-            _, x, v, event, _, _, _, _ = slip_until_event(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
+            _, x, v, event, _, _, _, _ = slip_until_event(
+                plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
+            )
             if event == LANDING:
                 mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
             elif event == TURNING:
@@ -929,6 +1075,32 @@ def classify(plant, v_belt, xs, vs, exits, exit_labels, centres, bounds, bound_l
 
 
 # One control interval -----------------------------------------------------------------------------------------------
+
+
+@in_lanes
+def _actuation(actuator, authority, a_limit, belt_speed, interval, v_belt, action):
+    """Return the force u and the belt's acceleration that an action in [-1, 1] means."""
+    if actuator == FORCE:
+        return authority * action, 0.0
+    target = (1.0 + authority * action) * belt_speed
+    return 0.0, min(max((target - v_belt) / interval, -a_limit), a_limit)
+
+
+@in_lanes
+def _weighed(x, x_end, int_v2, stick_time, int_fv, action, u, belt_speed, interval, w_effort, w_stick):
+    """Return the means over an interval of v^2, of the stick indicator, of the contact force's and of the control
+    force's power, and the three reward terms (vibration, effort, stick)."""
+    mean_v2 = int_v2 / interval
+    stick_fraction = stick_time / interval
+    return (
+        mean_v2,
+        stick_fraction,
+        int_fv / interval,
+        u * (x_end - x) / interval,
+        -mean_v2 / (belt_speed * belt_speed),
+        -w_effort * (action * action),
+        -w_stick * stick_fraction,
+    )
 
 
 @compiled
@@ -961,21 +1133,15 @@ def control_interval(
     least and greatest x, and the normal force at the end.
     """
     plant = Plant(geometry, alpha, g1, beta, mu_s, k1, k3)
-    u = 0.0
-    a_belt = 0.0
-    if actuator == FORCE:
-        u = authority * action
-    else:
-        target = (1.0 + authority * action) * belt_speed
-        a_belt = min(max((target - v_belt) / interval, -a_limit), a_limit)
-    x_start = x
-    x, v, v_belt, mode, status, _, n_events, int_v2, stick_time, int_fv, x_min, x_max = advance(
+    u, a_belt = _actuation(actuator, authority, a_limit, belt_speed, interval, v_belt, action)
+    x_end, v, v_belt, mode, status, _, n_events, int_v2, stick_time, int_fv, x_min, x_max = advance(
         plant, x, v, v_belt, a_belt, u, interval, None
     )
-    mean_v2 = int_v2 / interval
-    stick_fraction = stick_time / interval
+    mean_v2, stick_fraction, friction_power, control_power, vibration, effort, stick = _weighed(
+        x, x_end, int_v2, stick_time, int_fv, action, u, belt_speed, interval, w_effort, w_stick
+    )
     return (
-        x,
+        x_end,
         v,
         v_belt,
         mode,
@@ -983,16 +1149,16 @@ def control_interval(
         n_events,
         u,
         a_belt,
-        -mean_v2 / (belt_speed * belt_speed),
-        -w_effort * (action * action),
-        -w_stick * stick_fraction,
+        vibration,
+        effort,
+        stick,
         mean_v2,
         stick_fraction,
-        int_fv / interval,
-        u * (x - x_start) / interval,
+        friction_power,
+        control_power,
         x_min,
         x_max,
-        spring(plant, x)[1],
+        spring(plant, x_end)[1],
     )
 
 
@@ -1082,7 +1248,798 @@ def random_uniform(key, episode, step, slot):
 
 
 @compiled
+def random_uniforms(keys, episodes, step, slot):
+    """Return :func:`random_uniform` for arrays of keys and episodes, both (n,)."""
+    numbers = np.empty(len(keys))
+    for i in range(len(keys)):
+        numbers[i] = random_uniform(keys[i], episodes[i], step, slot)
+    return numbers
+
+
+@compiled
 def random_normal(key, episode, step, slot):
     """Return a standard normal number by Box and Muller's formula, from slots 2 slot and 2 slot + 1."""
     radius = math.sqrt(-2.0 * math.log(1.0 - random_uniform(key, episode, step, 2 * slot)))
     return radius * math.cos(2.0 * math.pi * random_uniform(key, episode, step, 2 * slot + 1))
+
+
+# A batch of environments --------------------------------------------------------------------------------------------
+#
+# Environments are stepped in blocks of LANES. In a block every environment takes one slip step over the whole interval
+# in vector instructions, whether it slips or not; those that stick are stepped side by side too; what met an event, a
+# turning point or a step that must be refined goes through control_interval, one by one. A lane is left on its fast
+# path only where control_interval would have done the very same arithmetic, so that both give the same bits.
+#
+# A block works in one flat array whose rows are STRIDE apart. With such constant distances the compiler sees that rows
+# do not overlap, which is what lets it use vector instructions.
+
+LANES = 256
+STRIDE = LANES + 8  # an odd number of cache lines, or rows would crowd into few places of the cache
+
+# Rows of the work space: what goes in ...
+_ALPHA, _G1, _BETA, _MU_S, _K1, _K3, _BELT_SPEED = 0, 1, 2, 3, 4, 5, 6
+_X, _V, _BELT, _ACTION, _U, _A_BELT = 7, 8, 9, 10, 11, 12
+# ... and what comes out.
+_X_END, _V_END, _BELT_END, _MODE, _EVENTS, _STATUS = 13, 14, 15, 16, 17, 18
+_INT_V2, _STICK_TIME, _INT_FV, _X_MIN, _X_MAX, _NORMAL = 19, 20, 21, 22, 23, 24
+_DONE_FAST = 25  # 1 where the fast path gave the answer
+_A, _A_END, _ERROR = 26, 27, 28
+_WORK_ROWS = 29
+WORK_SIZE = 2 * _WORK_ROWS * STRIDE  # a block's, and one for those of its environments that must be brought together
+# Rows of the second one while the places of events are looked at.
+_L_TIME, _L_SIDE, _L_LEVEL, _L_RATE, _L_MODE, _L_LANE = 13, 14, 15, 16, 17, 18
+_LOOK = 19  # and the eight after it
+
+# Rows of the environments' state, floats ...
+(
+    S_ALPHA,
+    S_G1,
+    S_BETA,
+    S_MU_S,
+    S_K1,
+    S_K3,
+    S_BELT_SPEED,
+    S_X,
+    S_V,
+    S_BELT,
+    S_TRAVEL,
+    S_WORST,
+    S_RETURN,
+    S_VIBRATION,
+    S_EFFORT,
+    S_STICK,
+    S_CONTACT_LOSS,
+    S_LATE_LOW,
+    S_LATE_HIGH,
+    S_LATE_STICK,
+    S_LATE_TIME,
+) = range(21)
+STATE_ROWS = 21
+# ... and whole numbers.
+I_GEOMETRY, I_STEPS, I_KEY, I_EPISODE, I_SEEN, I_OVER, I_FIRST_STEP = 0, 1, 2, 3, 4, 5, 6
+INTEGER_ROWS = 7
+RUNNING, TRUNCATED, ENDED = 0, 1, 2  # what I_OVER says
+
+# What a step reports of each environment, floats ...
+(
+    O_X,
+    O_V,
+    O_BELT,
+    O_V_REL,
+    O_NORMAL,
+    O_TIME,
+    O_ACTION,
+    O_FORCE,
+    O_A_BELT,
+    O_X_MIN,
+    O_X_MAX,
+    O_MEAN_V2,
+    O_STICK_FRACTION,
+    O_FRICTION_POWER,
+    O_CONTROL_POWER,
+    O_VIBRATION,
+    O_EFFORT,
+    O_STICK,
+    O_CONTACT_LOSS,
+) = range(19)
+REPORT_ROWS = 19
+# ... and whole numbers.
+C_MODE, C_EVENTS, C_STATUS = 0, 1, 2  # in the order of the work space
+CODE_ROWS = 3
+
+# Numbers that hold for the whole batch.
+(
+    T_AUTHORITY,
+    T_A_LIMIT,
+    T_INTERVAL,
+    T_W_EFFORT,
+    T_W_STICK,
+    T_CONTACT_LOSS_COST,
+    T_LIMIT,
+    T_X_OFFSET,
+    T_X_SCALE,
+    T_V_SCALE,
+    T_BELT_AUTHORITY,
+    T_SENSOR_NOISE,
+) = range(12)
+TASK_NUMBERS = 12
+T_ACTUATOR, T_EPISODE_STEPS, T_LATE_STEPS, T_FULL_STATE, T_SEES_BELT, T_SENSOR_DELAY = 0, 1, 2, 3, 4, 5
+TASK_CODES = 6
+
+
+# The cache would take it for slip_step itself.
+_slip_step_in_lanes = numba.njit(error_model="numpy", nogil=True, forceinline=True)(_slip_step)
+
+
+@in_lanes
+def _lane_plant(geometry, w, i):
+    return Plant(
+        geometry,
+        w[_ALPHA * STRIDE + i],
+        w[_G1 * STRIDE + i],
+        w[_BETA * STRIDE + i],
+        w[_MU_S * STRIDE + i],
+        w[_K1 * STRIDE + i],
+        w[_K3 * STRIDE + i],
+    )
+
+
+@in_lanes
+def _stays_open(gap, slope, gap_end, slope_end, h):
+    """Whether :func:`_dips` is sure to be false, told without a division and with a margin for its rounding."""
+    width = slope - slope_end
+    meeting = gap * width + slope * (gap_end - gap - slope_end * h)
+    return (slope >= 0.0) | (slope_end <= 0.0) | (meeting < 1e-12 * width)
+
+
+@in_lanes
+def _slip_lane(geometry, w, i, interval):
+    """Slip one lane over the whole interval in one step; mark it done if there is nothing else to it."""
+    plant = _lane_plant(geometry, w, i)
+    x = w[_X * STRIDE + i]
+    v = w[_V * STRIDE + i]
+    belt = w[_BELT * STRIDE + i]
+    a_belt = w[_A_BELT * STRIDE + i]
+    mode = 1.0 if v > belt else -1.0
+    side = 1.0 if v > 0.0 else -1.0
+    x_end, v_end, a, a_end, error, int_v2, int_fv = _slip_step_in_lanes(
+        plant, mode, x, v, belt, a_belt * interval, w[_U * STRIDE + i], interval
+    )
+    belt_end = belt + a_belt * interval
+    gap = mode * (v - belt)
+    gap_end = mode * (v_end - belt_end)
+    normal = spring(plant, x_end)[1]
+    done = (error <= TOLERANCE * interval) & (gap > V_REL_ZERO) & (gap_end > V_REL_ZERO) & (v * v_end > 0.0)
+    done = done & _stays_open(gap, mode * (a - a_belt), gap_end, mode * (a_end - a_belt), interval)
+    done = done & _stays_open(side * v, side * a, side * v_end, side * a_end, interval)
+    done = done & (normal > 0.0) & (spring(plant, x)[1] > 0.0)
+    w[_X_END * STRIDE + i] = x_end
+    w[_V_END * STRIDE + i] = v_end
+    w[_BELT_END * STRIDE + i] = belt_end
+    w[_MODE * STRIDE + i] = mode
+    w[_EVENTS * STRIDE + i] = 0.0
+    w[_STATUS * STRIDE + i] = 0.0
+    w[_INT_V2 * STRIDE + i] = int_v2
+    w[_STICK_TIME * STRIDE + i] = 0.0
+    w[_INT_FV * STRIDE + i] = 0.0 + int_fv
+    w[_X_MIN * STRIDE + i] = x_end if x_end < x else x
+    w[_X_MAX * STRIDE + i] = x_end if x_end > x else x
+    w[_NORMAL * STRIDE + i] = normal
+    w[_DONE_FAST * STRIDE + i] = 1.0 if done else 0.0
+    w[_A * STRIDE + i] = a
+    w[_A_END * STRIDE + i] = a_end
+    w[_ERROR * STRIDE + i] = error
+
+
+@in_lanes
+def _cone_side_holds(plant, side, x, belt, a_belt, u, interval):
+    excess, slope = _cone_excess(plant, side, x, belt, a_belt, u, 0.0)
+    excess_end, slope_end = _cone_excess(plant, side, x, belt, a_belt, u, interval)
+    return (excess <= 0.0) & (excess_end <= 0.0) & _stays_open(-excess, -slope, -excess_end, -slope_end, interval)
+
+
+@in_lanes
+def _stick_lane(geometry, w, i, interval):
+    """Let one lane ride with the belt over the whole interval; mark it done if it does so in one piece."""
+    plant = _lane_plant(geometry, w, i)
+    x = w[_X * STRIDE + i]
+    belt = w[_BELT * STRIDE + i]
+    a_belt = w[_A_BELT * STRIDE + i]
+    u = w[_U * STRIDE + i]
+    belt_end = belt + a_belt * interval
+    reach = 0.124 * (1.0 if geometry == LINEAR or plant.alpha > 1.0 else plant.alpha)
+    done = (abs(belt) * interval <= reach) & (abs(belt_end) * interval <= reach) & (belt * belt_end >= 0.0)
+    done = done & _cone_side_holds(plant, -1, x, belt, a_belt, u, interval)
+    done = done & _cone_side_holds(plant, 1, x, belt, a_belt, u, interval)
+    done = done & (spring(plant, x)[1] > 0.0)
+    dx, int_v2, int_fv = _ride(plant, x, belt, a_belt, u, interval)
+    x_end = x + dx
+    w[_X_END * STRIDE + i] = x_end
+    w[_V_END * STRIDE + i] = belt_end
+    w[_BELT_END * STRIDE + i] = belt_end
+    w[_MODE * STRIDE + i] = 0.0
+    w[_EVENTS * STRIDE + i] = 0.0
+    w[_STATUS * STRIDE + i] = 0.0
+    w[_INT_V2 * STRIDE + i] = int_v2
+    w[_STICK_TIME * STRIDE + i] = interval
+    w[_INT_FV * STRIDE + i] = 0.0 + int_fv
+    w[_X_MIN * STRIDE + i] = x_end if x_end < x else x
+    w[_X_MAX * STRIDE + i] = x_end if x_end > x else x
+    w[_NORMAL * STRIDE + i] = spring(plant, x_end)[1]
+    w[_DONE_FAST * STRIDE + i] = 1.0 if done else 0.0
+
+
+@in_lanes
+def _look_lane(geometry, w, i):
+    """Look at the place where one lane's slip step is thought to land or to turn."""
+    plant = _lane_plant(geometry, w, i)
+    x = w[_X * STRIDE + i]
+    v = w[_V * STRIDE + i]
+    belt = w[_BELT * STRIDE + i]
+    a_belt = w[_A_BELT * STRIDE + i]
+    u = w[_U * STRIDE + i]
+    mode = w[_L_MODE * STRIDE + i]
+    t = w[_L_TIME * STRIDE + i]
+    x_t, v_t, _, _, _, dv2, dfv = _slip_step_in_lanes(plant, mode, x, v, belt, a_belt * t, u, t)
+    look = _gap_there(
+        plant,
+        mode,
+        x_t,
+        v_t,
+        belt,
+        a_belt,
+        u,
+        t,
+        w[_L_SIDE * STRIDE + i],
+        w[_L_LEVEL * STRIDE + i],
+        w[_L_RATE * STRIDE + i],
+        dv2,
+        dfv,
+    )
+    for j in range(9):
+        w[(_LOOK + j) * STRIDE + i] = look[j]
+
+
+@compiled
+def _bring(w, i, sub, n):
+    """Copy what goes into lane i to lane n of the second work space."""
+    for row in range(_ACTION):
+        sub[row * STRIDE + n] = w[row * STRIDE + i]
+    sub[_U * STRIDE + n] = w[_U * STRIDE + i]
+    sub[_A_BELT * STRIDE + n] = w[_A_BELT * STRIDE + i]
+
+
+@compiled
+def _give_back(sub, n, w, i):
+    """Copy what came out of lane n of the second work space to lane i."""
+    for row in range(_X_END, _DONE_FAST + 1):
+        w[row * STRIDE + i] = sub[row * STRIDE + n]
+
+
+@compiled
+def _wants_look(w, i, sub, n, interval):
+    """Whether the slip step of lane i lands or turns in the plainest way; if so, tell lane n of the second work space
+    where. The tests are those of :func:`slip_until_event`."""
+    x = w[_X * STRIDE + i]
+    v = w[_V * STRIDE + i]
+    belt = w[_BELT * STRIDE + i]
+    a_belt = w[_A_BELT * STRIDE + i]
+    a = w[_A * STRIDE + i]
+    a_end = w[_A_END * STRIDE + i]
+    v_end = w[_V_END * STRIDE + i]
+    mode = 1 if v > belt else -1
+    gap = mode * (v - belt)
+    gap_end = mode * (v_end - (belt + a_belt * interval))
+    slope = mode * (a - a_belt)
+    slope_end = mode * (a_end - a_belt)
+    allowed = TOLERANCE * interval * max(1.0, abs(x), abs(v), STIFF * abs(a))
+    if not w[_ERROR * STRIDE + i] <= allowed or gap <= V_REL_ZERO:
+        return False
+    if gap_end <= 0.0:
+        t = _closing_guess(gap, slope, gap_end, slope_end, interval)
+        side, level, rate = mode, belt, a_belt
+    elif v * v_end < 0.0 and not _dips(gap, slope, gap_end, slope_end, interval):
+        side, level, rate = 1 if v > 0.0 else -1, 0.0, 0.0
+        t = _closing_guess(side * v, side * a, side * v_end, side * a_end, interval)
+    else:
+        return False
+    _bring(w, i, sub, n)
+    sub[_L_TIME * STRIDE + n] = t
+    sub[_L_SIDE * STRIDE + n] = side
+    sub[_L_LEVEL * STRIDE + n] = level
+    sub[_L_RATE * STRIDE + n] = rate
+    sub[_L_MODE * STRIDE + n] = mode
+    sub[_L_LANE * STRIDE + n] = i
+    return True
+
+
+@compiled
+def _lane_by_events(geometry, w, i, interval, known):
+    """Advance one lane as a single environment is; ``known``: see :func:`slip_until_event`."""
+    plant = _lane_plant(geometry, w, i)
+    x, v, belt, mode, status, _, n_events, int_v2, stick_time, int_fv, x_min, x_max = _advance(
+        plant,
+        w[_X * STRIDE + i],
+        w[_V * STRIDE + i],
+        w[_BELT * STRIDE + i],
+        w[_A_BELT * STRIDE + i],
+        w[_U * STRIDE + i],
+        interval,
+        None,
+        known,
+    )
+    w[_X_END * STRIDE + i] = x
+    w[_V_END * STRIDE + i] = v
+    w[_BELT_END * STRIDE + i] = belt
+    w[_MODE * STRIDE + i] = mode
+    w[_EVENTS * STRIDE + i] = n_events
+    w[_STATUS * STRIDE + i] = status
+    w[_INT_V2 * STRIDE + i] = int_v2
+    w[_STICK_TIME * STRIDE + i] = stick_time
+    w[_INT_FV * STRIDE + i] = int_fv
+    w[_X_MIN * STRIDE + i] = x_min
+    w[_X_MAX * STRIDE + i] = x_max
+    w[_NORMAL * STRIDE + i] = spring(plant, x)[1]
+    w[_DONE_FAST * STRIDE + i] = 1.0
+    return 0 if status == OK else 1
+
+
+@compiled
+def _lane_after_trial(geometry, w, i, sub, n, interval, stage):
+    """:func:`_lane_by_events` for lane i, whose first slip step is done (stage 1) and whose event was looked at in lane
+    n (stage 2)."""
+    known = (
+        stage,
+        w[_X_END * STRIDE + i],
+        w[_V_END * STRIDE + i],
+        w[_A * STRIDE + i],
+        w[_A_END * STRIDE + i],
+        w[_ERROR * STRIDE + i],
+        w[_INT_V2 * STRIDE + i],
+        w[_INT_FV * STRIDE + i],
+        sub[_L_TIME * STRIDE + n],
+        sub[_LOOK * STRIDE + n],
+        sub[(_LOOK + 1) * STRIDE + n],
+        sub[(_LOOK + 2) * STRIDE + n],
+        sub[(_LOOK + 3) * STRIDE + n],
+        sub[(_LOOK + 4) * STRIDE + n],
+        sub[(_LOOK + 5) * STRIDE + n],
+        sub[(_LOOK + 6) * STRIDE + n],
+        sub[(_LOOK + 7) * STRIDE + n],
+        sub[(_LOOK + 8) * STRIDE + n],
+    )
+    return _lane_by_events(geometry, w, i, interval, known)
+
+
+@in_lanes
+def _whole(m):
+    """Return m rounded up to whole vectors; what is computed in the lanes beyond m is not looked at."""
+    return 8 * ((m + 7) // 8)
+
+
+@in_lanes
+def _observed(value, offset, scale, limit):
+    """Return (value - offset)/scale, no further from zero than the limit."""
+    scaled = (value - offset) / scale
+    return scaled if abs(scaled) <= limit else math.copysign(limit, scaled)
+
+
+@compiled
+def _sense(task, codes, integers, past, x, v, i):
+    """Return x and v of environment i as its sensor gives them: some intervals old, with the noise of that time."""
+    if task[T_SENSOR_NOISE] > 0.0:
+        key = integers[I_KEY, i]
+        episode = integers[I_EPISODE, i]
+        step = integers[I_STEPS, i] + 1
+        x += task[T_SENSOR_NOISE] * random_normal(key, episode, step, 0)
+        if codes[T_FULL_STATE]:
+            v += task[T_SENSOR_NOISE] * random_normal(key, episode, step, 1)
+    delay = codes[T_SENSOR_DELAY]
+    if delay == 0:
+        return x, v
+    seen = integers[I_SEEN, i]
+    integers[I_SEEN, i] = seen + 1
+    past[seen % (delay + 1), 0, i] = x
+    past[seen % (delay + 1), 1, i] = v
+    oldest = max(0, seen - delay) % (delay + 1)
+    return past[oldest, 0, i], past[oldest, 1, i]
+
+
+@compiled
+def observe(task, codes, state, integers, past, shown, observations, which):
+    """Write the observations of the environments ``which`` (k,) into rows of ``observations`` (n, size), float32.
+
+    ``past`` (delay + 1, 2, n) is the sensor's memory, ``shown`` (n, p) the scaled parameters shown.
+    """
+    limit = task[T_LIMIT]
+    for i in which:
+        x, v = _sense(task, codes, integers, past, state[S_X, i], state[S_V, i], i)
+        observations[i, 0] = _observed(x, task[T_X_OFFSET], task[T_X_SCALE], limit)
+        place = 1
+        if codes[T_FULL_STATE]:
+            observations[i, 1] = _observed(v, 0.0, task[T_V_SCALE], limit)
+            place = 2
+        if codes[T_SEES_BELT]:
+            modulation = state[S_BELT, i] / state[S_BELT_SPEED, i]
+            observations[i, place] = _observed(modulation, 1.0, task[T_BELT_AUTHORITY], limit)
+            place += 1
+        for j in range(shown.shape[1]):
+            observations[i, place + j] = shown[i, j]
+
+
+@compiled
+def first_bad(actions):
+    """Return the place of the first value of ``actions`` (n,) that is not finite, or -1."""
+    total = 0.0
+    for i in range(len(actions)):
+        total += abs(actions[i]) * 0.0
+    if total == 0.0:
+        return -1
+    for i in range(len(actions)):
+        if not math.isfinite(actions[i]):
+            return i
+    return -1
+
+
+# Rows of the second work space once it is free again: the report's, in its order, and two more.
+_Q_REWARD, _Q_WAY = REPORT_ROWS, REPORT_ROWS + 1
+
+
+@compiled
+def _weigh_lanes(w, q, m, interval, w_effort, w_stick):
+    for i in range(m):
+        x_end = w[_X_END * STRIDE + i]
+        v_end = w[_V_END * STRIDE + i]
+        belt_end = w[_BELT_END * STRIDE + i]
+        mean_v2, stick_fraction, friction_power, control_power, vibration, effort, stick = _weighed(
+            w[_X * STRIDE + i],
+            x_end,
+            w[_INT_V2 * STRIDE + i],
+            w[_STICK_TIME * STRIDE + i],
+            w[_INT_FV * STRIDE + i],
+            w[_ACTION * STRIDE + i],
+            w[_U * STRIDE + i],
+            w[_BELT_SPEED * STRIDE + i],
+            interval,
+            w_effort,
+            w_stick,
+        )
+        q[O_X * STRIDE + i] = x_end
+        q[O_V * STRIDE + i] = v_end
+        q[O_BELT * STRIDE + i] = belt_end
+        q[O_V_REL * STRIDE + i] = v_end - belt_end
+        q[O_NORMAL * STRIDE + i] = w[_NORMAL * STRIDE + i]
+        q[O_TIME * STRIDE + i] = 0.0
+        q[O_ACTION * STRIDE + i] = w[_ACTION * STRIDE + i]
+        q[O_FORCE * STRIDE + i] = w[_U * STRIDE + i]
+        q[O_A_BELT * STRIDE + i] = w[_A_BELT * STRIDE + i]
+        q[O_X_MIN * STRIDE + i] = w[_X_MIN * STRIDE + i]
+        q[O_X_MAX * STRIDE + i] = w[_X_MAX * STRIDE + i]
+        q[O_MEAN_V2 * STRIDE + i] = mean_v2
+        q[O_STICK_FRACTION * STRIDE + i] = stick_fraction
+        q[O_FRICTION_POWER * STRIDE + i] = friction_power
+        q[O_CONTROL_POWER * STRIDE + i] = control_power
+        q[O_VIBRATION * STRIDE + i] = vibration
+        q[O_EFFORT * STRIDE + i] = effort
+        q[O_STICK * STRIDE + i] = stick
+        q[O_CONTACT_LOSS * STRIDE + i] = 0.0
+        q[_Q_REWARD * STRIDE + i] = vibration + effort + stick
+        q[_Q_WAY * STRIDE + i] = 0.5 * (w[_BELT * STRIDE + i] + belt_end) * interval
+
+
+@compiled
+def _account(task, codes, state, integers, w, q, rewards, over, report, report_codes, first, m, failures):
+    """Write down what a block's step came to; return how many of its environments ended their episode."""
+    # Every row is cut out first and then counted from 0, which is what vector instructions need.
+    interval = task[T_INTERVAL]
+    last_step = codes[T_EPISODE_STEPS]
+    late_steps = codes[T_LATE_STEPS]
+    _weigh_lanes(w, q, m, interval, task[T_W_EFFORT], task[T_W_STICK])
+    for row in range(REPORT_ROWS):
+        place = report[row, first : first + m]
+        for i in range(m):
+            place[i] = q[row * STRIDE + i]
+    for row in range(CODE_ROWS):
+        code = report_codes[row, first : first + m]
+        for i in range(m):
+            code[i] = int(w[(_MODE + row) * STRIDE + i])
+    for row in range(3):
+        place = state[S_X + row, first : first + m]
+        for i in range(m):
+            place[i] = q[(O_X + row) * STRIDE + i]
+    for row in range(3):
+        place = state[S_VIBRATION + row, first : first + m]
+        for i in range(m):
+            place[i] += q[(O_VIBRATION + row) * STRIDE + i]
+    travel = state[S_TRAVEL, first : first + m]
+    for i in range(m):
+        travel[i] += q[_Q_WAY * STRIDE + i]
+    total = state[S_RETURN, first : first + m]
+    worst = state[S_WORST, first : first + m]
+    reward = rewards[first : first + m]
+    for i in range(m):
+        reward[i] = q[_Q_REWARD * STRIDE + i]
+    for i in range(m):
+        cost = -q[_Q_REWARD * STRIDE + i]
+        worst[i] = cost if cost > worst[i] else worst[i]
+    steps = integers[I_STEPS, first : first + m]
+    time = report[O_TIME, first : first + m]
+    terminated = over[0, first : first + m]
+    truncated = over[1, first : first + m]
+    late = 0
+    ended = 0
+    for i in range(m):
+        steps[i] += 1
+    for i in range(m):
+        time[i] = steps[i] * interval
+    for i in range(m):
+        terminated[i] = False
+    for i in range(m):
+        truncated[i] = steps[i] >= last_step
+    for i in range(m):
+        late += 1 if steps[i] > late_steps else 0
+    for i in range(m):
+        ended += 1 if steps[i] >= last_step else 0
+    if late > 0:
+        for i in range(first, first + m):
+            if integers[I_STEPS, i] > codes[T_LATE_STEPS]:
+                state[S_LATE_LOW, i] = min(state[S_LATE_LOW, i], report[O_X_MIN, i])
+                state[S_LATE_HIGH, i] = max(state[S_LATE_HIGH, i], report[O_X_MAX, i])
+                state[S_LATE_STICK, i] += report[O_STICK_FRACTION, i]
+                state[S_LATE_TIME, i] += 1.0
+    if ended > 0:
+        for i in range(first, first + m):
+            if over[1, i]:
+                integers[I_OVER, i] = TRUNCATED
+    if failures > 0:
+        for i in range(first, first + m):
+            status = report_codes[C_STATUS, i]
+            if status != OK:
+                ended += 0 if over[1, i] else 1
+                integers[I_OVER, i] = ENDED
+                if status != CONTACT_LOST:
+                    over[1, i] = True
+                    continue
+                over[0, i] = True
+                steps_left = max(0, last_step - integers[I_STEPS, i]) + 1
+                loss = -steps_left * max(task[T_CONTACT_LOSS_COST], state[S_WORST, i])
+                report[O_CONTACT_LOSS, i] = loss
+                state[S_CONTACT_LOSS, i] += loss
+                rewards[i] += loss
+    for i in range(m):
+        total[i] += reward[i]
+    return ended
+
+
+@compiled
+def _observe_block(task, codes, w, shown, observations, first, m):
+    """:func:`observe` for a block whose sensors neither wait nor err."""
+    limit = task[T_LIMIT]
+    x_offset = task[T_X_OFFSET]
+    x_scale = task[T_X_SCALE]
+    v_scale = task[T_V_SCALE]
+    authority = task[T_BELT_AUTHORITY]
+    block = observations[first : first + m]
+    for i in range(m):
+        block[i, 0] = _observed(w[_X_END * STRIDE + i], x_offset, x_scale, limit)
+    place = 1
+    if codes[T_FULL_STATE]:
+        for i in range(m):
+            block[i, 1] = _observed(w[_V_END * STRIDE + i], 0.0, v_scale, limit)
+        place = 2
+    if codes[T_SEES_BELT]:
+        for i in range(m):
+            modulation = w[_BELT_END * STRIDE + i] / w[_BELT_SPEED * STRIDE + i]
+            block[i, place] = _observed(modulation, 1.0, authority, limit)
+        place += 1
+    for i in range(m):
+        for j in range(shown.shape[1]):
+            block[i, place + j] = shown[first + i, j]
+
+
+@compiled
+def _fill(w, task, codes, state, actions, first, m):
+    """Fill a block's work space with what goes into its step."""
+    for row in range(_ACTION):
+        source = state[row, first : first + m]
+        for i in range(m):
+            w[row * STRIDE + i] = source[i]
+    action = actions[first : first + m]
+    for i in range(m):
+        w[_ACTION * STRIDE + i] = min(max(action[i], -1.0), 1.0)
+    actuator = codes[T_ACTUATOR]
+    authority = task[T_AUTHORITY]
+    a_limit = task[T_A_LIMIT]
+    interval = task[T_INTERVAL]
+    for i in range(m):
+        u, a_belt = _actuation(
+            actuator,
+            authority,
+            a_limit,
+            w[_BELT_SPEED * STRIDE + i],
+            interval,
+            w[_BELT * STRIDE + i],
+            w[_ACTION * STRIDE + i],
+        )
+        w[_U * STRIDE + i] = u
+        w[_A_BELT * STRIDE + i] = a_belt
+
+
+def _stepper(geometry):
+    """Return the function that steps a batch most of whose environments have this geometry, compiled when first used.
+
+    It takes
+
+        work: (WORK_SIZE,), this call's own. start, end: which environments to step.
+        task (12,), codes (6,): what holds for the whole batch. state (21, n), integers (7, n): of each environment;
+            rows as named above. past, shown: see :func:`observe`.
+        actions: (n,), finite; outside [-1, 1] they are clipped.
+        observations (n, size), rewards (n,), over (2, n) (terminated, truncated), report (19, n) and report_codes
+            (3, n): written.
+
+    and returns how many of them ended their episode. The law of a step is :func:`control_interval`'s.
+    """
+
+    @compiled
+    def step_environments(
+        work,
+        start,
+        end,
+        task,
+        codes,
+        state,
+        integers,
+        past,
+        shown,
+        actions,
+        observations,
+        rewards,
+        over,
+        report,
+        report_codes,
+    ):
+        interval = task[T_INTERVAL]
+        w = work[: _WORK_ROWS * STRIDE]
+        sub = work[_WORK_ROWS * STRIDE :]
+        plain = task[T_SENSOR_NOISE] == 0.0 and codes[T_SENSOR_DELAY] == 0
+        ended = 0
+        for first in range(start, end, LANES):
+            m = min(LANES, end - first)
+            _fill(w, task, codes, state, actions, first, m)
+            geometries = integers[I_GEOMETRY, first : first + m]
+            stuck = 0
+            for i in range(m):
+                stuck += 1 if w[_V * STRIDE + i] == w[_BELT * STRIDE + i] else 0
+            fast = interval <= MAX_SLIP_STEP and m > 1
+            if fast and m > stuck:
+                for i in range(_whole(m)):
+                    _slip_lane(geometry, w, i, interval)
+            else:
+                for i in range(m):
+                    w[_DONE_FAST * STRIDE + i] = 0.0
+            if fast and stuck > 0:
+                # Few or many, those that stick are brought together and stepped side by side.
+                n = 0
+                for i in range(m):
+                    if w[_V * STRIDE + i] == w[_BELT * STRIDE + i]:
+                        _bring(w, i, sub, n)
+                        n += 1
+                for i in range(_whole(n)):
+                    _stick_lane(geometry, sub, i, interval)
+                n = 0
+                for i in range(m):
+                    if w[_V * STRIDE + i] == w[_BELT * STRIDE + i]:
+                        _give_back(sub, n, w, i)
+                        n += 1
+            failures = 0
+            n = 0
+            for i in range(m):
+                if geometries[i] != geometry:
+                    failures += _lane_by_events(geometries[i], w, i, interval, NOTHING_KNOWN)
+                elif w[_DONE_FAST * STRIDE + i] == 0.0:
+                    if not fast or w[_V * STRIDE + i] == w[_BELT * STRIDE + i]:
+                        failures += _lane_by_events(geometry, w, i, interval, NOTHING_KNOWN)
+                    elif _wants_look(w, i, sub, n, interval):
+                        n += 1
+                    else:
+                        failures += _lane_after_trial(geometry, w, i, sub, 0, interval, 1.0)
+            if n > 0:
+                # Events in the midst of a slip step are looked at side by side as well.
+                for i in range(_whole(n)):
+                    _look_lane(geometry, sub, i)
+                for j in range(n):
+                    failures += _lane_after_trial(geometry, w, int(sub[_L_LANE * STRIDE + j]), sub, j, interval, 2.0)
+            ended += _account(
+                task, codes, state, integers, w, sub, rewards, over, report, report_codes, first, m, failures
+            )
+            if plain:
+                _observe_block(task, codes, w, shown, observations, first, m)
+            else:
+                observe(task, codes, state, integers, past, shown, observations, range(first, first + m))
+        return ended
+
+    return step_environments
+
+
+_step_exact = _stepper(EXACT)
+_step_cubic = _stepper(CUBIC)
+_step_linear = _stepper(LINEAR)
+STEPPERS = (_step_exact, _step_cubic, _step_linear)
+
+
+@in_threads
+def _step_exact_in_threads(works, bounds, ended, *arguments):
+    for i in numba.prange(len(ended)):
+        ended[i] = _step_exact(works[i], bounds[i], bounds[i + 1], *arguments)
+
+
+@in_threads
+def _step_cubic_in_threads(works, bounds, ended, *arguments):
+    for i in numba.prange(len(ended)):
+        ended[i] = _step_cubic(works[i], bounds[i], bounds[i + 1], *arguments)
+
+
+@in_threads
+def _step_linear_in_threads(works, bounds, ended, *arguments):
+    for i in numba.prange(len(ended)):
+        ended[i] = _step_linear(works[i], bounds[i], bounds[i + 1], *arguments)
+
+
+# The same side by side: works (k, WORK_SIZE), bounds (k + 1,) and ended (k,) for k threads.
+STEPPERS_IN_THREADS = (_step_exact_in_threads, _step_cubic_in_threads, _step_linear_in_threads)
+
+
+@compiled
+def _plant_of(state, integers, i):
+    return Plant(
+        integers[I_GEOMETRY, i],
+        state[S_ALPHA, i],
+        state[S_G1, i],
+        state[S_BETA, i],
+        state[S_MU_S, i],
+        state[S_K1, i],
+        state[S_K3, i],
+    )
+
+
+@compiled
+def cycle_starts(state, integers, which, phases, x_phase0, v_phase0, period, drawn):
+    """Put the environments ``which`` (k,) on the passive limit cycle at ``phases`` (k,).
+
+    Without ``drawn`` the cycle is the given one (a period of 0: a state and no more). With it each environment has a
+    cycle of its own, the one that a mass set down at x = 0 with the belt reaches. Return (k,) flags, 1 where that is
+    no stick-slip cycle that is found at once: those states are left alone.
+    """
+    left = np.zeros(len(which), dtype=np.uint8)
+    exits = np.empty(SETTLING_EXITS)
+    for j in range(len(which)):
+        i = which[j]
+        speed = state[S_BELT_SPEED, i]
+        plant = _plant_of(state, integers, i)
+        x, v, duration = x_phase0, v_phase0, phases[j] * period
+        if drawn:
+            outcome, x, _, _ = settle(plant, speed, 0.0, speed, SETTLING_LAPS, exits)
+            if outcome == REPEATED_BREAKAWAY:
+                lap = stick_slip_lap(plant, speed, x)
+                outcome = lap[0]
+                v, duration = speed, phases[j] * lap[1]
+            if outcome != REPEATED_BREAKAWAY:
+                left[j] = 1
+                continue
+        if duration > 0.0:
+            end = advance(plant, x, v, speed, 0.0, 0.0, duration, None)
+            x, v = end[0], end[1]
+        state[S_X, i] = x
+        state[S_V, i] = v
+    return left
+
+
+@compiled
+def contact(state, integers, which, modes, normal_forces):
+    """Write the mode and the normal force of the environments ``which`` (k,), which have just been reset, (k,) each."""
+    for j in range(len(which)):
+        i = which[j]
+        plant = _plant_of(state, integers, i)
+        x, belt = state[S_X, i], state[S_BELT, i]
+        modes[j] = mode_of(plant, x, state[S_V, i], belt, 0.0, 0.0)
+        normal_forces[j] = spring(plant, x)[1]

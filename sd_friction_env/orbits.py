@@ -22,10 +22,8 @@ from sd_friction_env.theory import cubic_wells, exact_wells
 
 Kind = Literal["stick-slip", "pure-slip", "steady-slip", "rest"]
 
-_SETTLING_LAPS = 8
 _LONG_SETTLING_LAPS = 800
 _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are called the equilibrium
-_EXITS = 64
 _BELT_SPEED_ERROR = 1e-11  # v_b0 is given this much too low: on the very graze rounding decides whether a cycle sticks
 
 
@@ -196,10 +194,10 @@ def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | Non
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
     v = parameters.belt_speed if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
     at_x, at_v = x, v
-    laps = _SETTLING_LAPS
+    laps = kernel.SETTLING_LAPS
     for _ in range(40):
         outcome, place, previous, lowest = kernel.settle(
-            parameters.plant, parameters.belt_speed, at_x, at_v, laps, np.empty(_EXITS)
+            parameters.plant, parameters.belt_speed, at_x, at_v, laps, np.empty(kernel.SETTLING_EXITS)
         )
         if outcome == kernel.REPEATED_BREAKAWAY:
             return _stick_slip(parameters, place, x, v)

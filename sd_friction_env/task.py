@@ -4,7 +4,10 @@ import dataclasses
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sd_friction_env import kernel
 from sd_friction_env.orbits import LimitCycle, OrbitError, equilibria, limit_cycle, rest_place
@@ -13,6 +16,9 @@ from sd_friction_env.parameters import RANGES, STATE_LIMIT, OscillatorParameters
 Actuator = Literal["force", "belt_speed"]
 Start = Literal["cycle", "rest", "random"]
 Sensor = Literal["state", "position"]
+
+FloatArray: TypeAlias = NDArray[np.float64]
+IntegerArray: TypeAlias = NDArray[np.int64]
 
 RANDOMISABLE = ("alpha", "g1", "beta", "mu_s", "mu_m", "v_m", "belt_speed")
 
@@ -125,6 +131,16 @@ class Task:
             raise TypeError(f"unknown argument {unknown[0]!r}; allowed: {', '.join(cls.field_names())}")
         return cls(**arguments)
 
+    @property
+    def authority(self) -> float:
+        """What an action of 1 means to the actuator: ``force_limit`` or ``belt_authority``."""
+        return self.force_limit if self.actuator == "force" else self.belt_authority
+
+    @property
+    def late_steps(self) -> int:
+        """Steps before the last quarter of an episode."""
+        return self.episode_steps - max(1, self.episode_steps // 4)
+
     def with_scales(self, nominal: OscillatorParameters) -> Self:
         """Return the task with the observation scales that were left open taken from the nominal plant's motion."""
         if None not in (self.x_offset, self.x_scale, self.v_scale):
@@ -142,27 +158,48 @@ class Task:
             v_scale=0.5 * nominal.belt_speed if self.v_scale is None else self.v_scale,
         )
 
+    def draws(self, keys: IntegerArray, episodes: IntegerArray) -> dict[str, FloatArray]:
+        """Return the values drawn for the randomised parameters of n episodes, by name, each (n,).
+
+        Args:
+            keys, episodes: (n,), whole numbers; each episode's values depend on its own two alone.
+        """
+        values = {}
+        for name, (low, high) in self.randomise.items():
+            shares = kernel.random_uniforms(keys, episodes, 0, _PARAMETER_SLOT + RANDOMISABLE.index(name))
+            values[name] = low + (high - low) * shares
+        return values
+
+    def phases(self, keys: IntegerArray, episodes: IntegerArray) -> FloatArray:
+        """Return the phases of the passive cycle at which n episodes start, (n,)."""
+        phases: FloatArray = kernel.random_uniforms(keys, episodes, 0, _PHASE_SLOT)
+        return phases
+
+    def random_states(self, keys: IntegerArray, episodes: IntegerArray) -> tuple[FloatArray, FloatArray]:
+        """Return the states x and v, each (n,), at which n episodes with the start "random" begin."""
+        assert self.x_offset is not None
+        assert self.x_scale is not None
+        assert self.v_scale is not None
+        x_share = 2.0 * kernel.random_uniforms(keys, episodes, 0, _X_SLOT) - 1.0
+        v_share = 2.0 * kernel.random_uniforms(keys, episodes, 0, _V_SLOT) - 1.0
+        return self.x_offset + 3.0 * self.x_scale * x_share, 4.0 * self.v_scale * v_share
+
     def drawn_parameters(self, nominal: OscillatorParameters, key: int, episode: int) -> OscillatorParameters:
         """Return an episode's parameters: the nominal ones with the randomised ones drawn."""
         if not self.randomise:
             return nominal
-        drawn = {}
-        for name, (low, high) in self.randomise.items():
-            share = kernel.random_uniform(key, episode, 0, _PARAMETER_SLOT + RANDOMISABLE.index(name))
-            drawn[name] = low + (high - low) * share
-        return nominal.replace(**drawn)
+        drawn = self.draws(np.array([key]), np.array([episode]))
+        return nominal.replace(**{name: float(values[0]) for name, values in drawn.items()})
 
     def start_state(self, parameters: OscillatorParameters, key: int, episode: int) -> tuple[float, float]:
         """Return the (x, v) at which an episode starts."""
         if self.start == "rest":
             return rest_place(parameters), 0.0
+        keys, episodes = np.array([key]), np.array([episode])
         if self.start == "random":
-            assert self.x_offset is not None
-            assert self.x_scale is not None
-            assert self.v_scale is not None
-            shares = [2.0 * kernel.random_uniform(key, episode, 0, slot) - 1.0 for slot in (_X_SLOT, _V_SLOT)]
-            return self.x_offset + 3.0 * self.x_scale * shares[0], 4.0 * self.v_scale * shares[1]
-        return self.cycle_state(parameters, kernel.random_uniform(key, episode, 0, _PHASE_SLOT))
+            x, v = self.random_states(keys, episodes)
+            return float(x[0]), float(v[0])
+        return self.cycle_state(parameters, float(self.phases(keys, episodes)[0]))
 
     def cycle_state(self, parameters: OscillatorParameters, phase: float) -> tuple[float, float]:
         """Return the passive cycle's state at a phase in [0, 1], or the kicked equilibrium where nothing oscillates."""

@@ -1,0 +1,870 @@
+"""Many friction oscillators at once as a Gymnasium vector environment, stepped without Python in between."""
+
+import functools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from sd_friction_env import kernel
+from sd_friction_env.env import (
+    ACTUATOR_CODES,
+    EPISODE_STATISTICS,
+    EnvState,
+    RewardFunction,
+    SDFrictionEnv,
+    check_belt,
+    checked_options,
+    start_of,
+)
+from sd_friction_env.parameters import GEOMETRIES, RANGES, OscillatorParameters, checked_number
+from sd_friction_env.simulation import amplitude
+from sd_friction_env.startup import announced
+from sd_friction_env.task import FloatArray, IntegerArray, Task, passive_motion
+from sd_friction_env.theory import stribeck_coefficients
+
+_MOST_ENVS = 2**24
+_MOST_THREADS = 256
+_ENVS_WORTH_A_THREAD = 512
+_MOST_RENDERED = 16
+
+_REPORT = (
+    "x",
+    "v",
+    "v_belt",
+    "v_rel",
+    "normal_force",
+    "time",
+    "action",
+    "force",
+    "belt_acceleration",
+    "x_min",
+    "x_max",
+    "mean_square_velocity",
+    "stick_fraction",
+    "friction_power",
+    "control_power",
+    "reward_vibration",
+    "reward_effort",
+    "reward_stick",
+    "reward_contact_loss",
+)
+_STEP_KEYS = (*_REPORT, "mode", "events", "status")
+_STATUS_NAMES = np.array([kernel.STATUS_NAMES[code] for code in sorted(kernel.STATUS_NAMES)], object)
+_RESET_KEYS = ("x", "v", "v_belt", "v_rel", "mode", "normal_force", "time")
+_ONLY_STEP_KEYS = tuple(name for name in _STEP_KEYS if name not in _RESET_KEYS)
+_NUMBERS = tuple(RANGES)  # the numeric fields of OscillatorParameters
+_STATE_ROWS = {
+    "alpha": kernel.S_ALPHA,
+    "g1": kernel.S_G1,
+    "beta": kernel.S_BETA,
+    "mu_s": kernel.S_MU_S,
+    "belt_speed": kernel.S_BELT_SPEED,
+}
+
+
+class _Buffers(NamedTuple):
+    """What a step hands out."""
+
+    rewards: FloatArray
+    over: NDArray[np.bool_]
+    report: FloatArray
+    codes: IntegerArray
+
+
+class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+    """
+    ## Description
+
+    ``num_envs`` environments of the kind :class:`SDFrictionEnv` describes, stepped together: ``gym.make_vec(id,
+    num_envs=...)``. Environment i does bit for bit what the single environment does that is reset with the same seed,
+    whatever ``num_envs``, its place in the batch and the number of threads.
+
+    ## Action Space, Observation Space, Rewards, Starting State, Episode End
+
+    As of :class:`SDFrictionEnv`, with a leading axis of length ``num_envs``.
+
+    ## Seeds
+
+    ``reset(seed=7)`` seeds environment i with 7 + i, ``reset(seed=[...])`` with what the list says (None: not at
+    all).
+
+    ## Options
+
+    Those of :class:`SDFrictionEnv`; each value may also be an array (num_envs,), one entry per environment, and
+    ``parameters`` a mapping of names to numbers or to such arrays, or a sequence of ``num_envs`` mappings. They hold
+    for the episodes that this reset starts. ``reset_mask``, a boolean array (num_envs,), says which environments are
+    reset; the others go on.
+
+    ## Info
+
+    A dictionary of arrays as Gymnasium's own vector environments have it: beside each array "name" stands a mask
+    "_name". All masks that are true throughout are one read-only array. When episodes end, ``statistics`` holds their
+    return, length, late amplitude and so on (see :class:`SDFrictionEnv`).
+
+    ## Arguments
+
+    num_envs: in [1, 2**24].
+    parameters, reward, and every field of :class:`Task`: as of :class:`SDFrictionEnv`. A ``reward`` function is called
+        once per environment and step: slow; an array expression of ``info`` in a vector wrapper is not.
+    autoreset_mode: "NextStep" (the default), "SameStep" or "Disabled" (https://farama.org/Vector-Autoreset-Mode).
+    threads: how many threads may share a step, in [1, 256]; batches of fewer than 512 environments per thread use
+        fewer. More than 1 pays where that many cores are idle.
+    copy: True hands out new arrays at every step. False: they are overwritten by the next step (a little faster).
+    render_mode: "rgb_array" (:meth:`render` returns a tuple of frames) or "human" (a window for one environment).
+    render_envs: which environments are drawn; None: the first 16 (of "human": the first).
+
+    Raises:
+        TypeError, ValueError: if an argument is not as said, naming it and what is allowed.
+    """
+
+    metadata: dict[str, Any] = {**SDFrictionEnv.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        parameters: OscillatorParameters | Mapping[str, Any] | None = None,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        threads: int = 1,
+        copy: bool = True,
+        render_mode: str | None = None,
+        render_envs: Iterable[int] | None = None,
+        reward: RewardFunction | None = None,
+        **task_arguments: Any,
+    ) -> None:
+        super().__init__()
+        if "max_episode_steps" in task_arguments:
+            raise TypeError("max_episode_steps is no argument of a batch of these environments: use episode_steps")
+        n = self.num_envs = _whole("num_envs", num_envs, 1, _MOST_ENVS)
+        self.threads = _whole("threads", threads, 1, _MOST_THREADS)
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            allowed = ", ".join(repr(mode.value) for mode in AutoresetMode)
+            raise ValueError(f"autoreset_mode must be one of {allowed}, got {autoreset_mode!r}") from None
+        if not isinstance(copy, bool):
+            raise TypeError(f"copy must be True or False, got {copy!r}")
+        self.copy = copy
+        self._single = SDFrictionEnv(parameters, render_mode=render_mode, reward=reward, **task_arguments)
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.nominal = self._single.nominal
+        self.task = self._single.task
+        self.reward = reward
+        self.single_observation_space = self._single.observation_space
+        self.single_action_space = self._single.action_space
+        self.observation_space = batch_space(self.single_observation_space, n)
+        self.action_space = batch_space(self.single_action_space, n)
+
+        task = self.task
+        self._geometry = self.nominal.plant.geometry
+        self._nominal_numbers = np.array([[getattr(self.nominal, name)] for name in _NUMBERS])
+        self._task_numbers, self._task_codes = _task_arrays(task)
+        # Rows of an odd number of cache lines: lengths of a power of two would crowd into few places of the cache.
+        self._width = n if n < kernel.LANES else 8 * (2 * (n // 16) + 3)
+        self._state = np.zeros((kernel.STATE_ROWS, self._width))
+        self._integers = np.zeros((kernel.INTEGER_ROWS, self._width), np.int64)
+        self._numbers = np.zeros((len(_NUMBERS), n))
+        self._past = np.zeros((task.sensor_delay + 1 if task.sensor_delay else 0, 2, n))
+        self._shown = np.zeros((n, len(task.randomise) if task.show_parameters else 0))
+        shares = max(1, min(self.threads, n // _ENVS_WORTH_A_THREAD))
+        self._works = np.ones((shares, kernel.WORK_SIZE))
+        # Every share but the last is made of whole blocks.
+        blocks = -(-n // kernel.LANES)
+        self._bounds = np.minimum(kernel.LANES * (np.arange(shares + 1) * blocks // shares), n)
+        self._ended = np.zeros(shares, np.int64)
+        shape = self.single_observation_space.shape
+        assert shape is not None
+        self._observations = np.zeros((n, *shape), np.float32)
+        self._kept: _Buffers | None = None
+        self._everyone = np.arange(n)
+        # What holds for all is one array for all steps, and cannot be written to.
+        self._all = np.ones(n, np.bool_)
+        self._all_ok = np.full(n, kernel.STATUS_NAMES[kernel.OK], object)
+        for shared in (self._all, self._all_ok):
+            shared.setflags(write=False)
+        self._masks = {f"_{name}": self._all for name in _STEP_KEYS}
+        self._over = np.zeros(0, np.int64)  # whose episodes ended with the last step
+        self._seeds: list[int | None] = [None] * n
+        self._is_reset = False
+        self._attributes: dict[str, list[Any]] = {}
+        self._views = _views(self._single, render_envs, n, render_mode)
+
+    # Starting ---------------------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start episodes, in all environments or in those of ``options["reset_mask"]``; see the class.
+
+        Returns:
+            Observations (num_envs, size), float32, and info.
+
+        Raises:
+            TypeError, ValueError: if an option or a seed is not as said; all running episodes are then untouched.
+            gymnasium.error.ResetNeeded: if some are to go on that were never reset.
+        """
+        n = self.num_envs
+        seeds = _checked_seeds(seed, n)
+        mask, per_env = _checked_batch_options(options, n)
+        which = self._everyone if mask is None else np.flatnonzero(mask)
+        if not self._is_reset and len(which) < n:
+            raise gym.error.ResetNeeded("reset all environments once before resetting some: the others have no state")
+        keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which] + 1
+        new_seeds = list(self._seeds)
+        for place, i in enumerate(which.tolist()):
+            if seeds[i] is not None:
+                new_seeds[i] = seeds[i]
+                keys[place], episodes[place] = seeding.np_random(seeds[i])[0].integers(2**62), 0
+            elif not self._is_reset:
+                keys[place], episodes[place] = self.np_random.integers(2**62), 0
+        parameters, geometries = self._drawn(keys, episodes)
+        x, v, placed = self._given(which, keys, episodes, per_env, parameters, geometries)
+        # Nothing can go wrong from here on, and only now is anything changed.
+        self._integers[kernel.I_KEY, which] = keys
+        self._integers[kernel.I_EPISODE, which] = episodes
+        self._seeds = new_seeds
+        self._is_reset = True
+        self._begin(which, parameters, geometries, x, v, placed)
+        self._over = self._over[~np.isin(self._over, which)]
+        info = self._reset_info(which, self._at_start(which))
+        return self._observations.copy() if self.copy else self._observations, info
+
+    def _drawn(self, keys: IntegerArray, episodes: IntegerArray) -> tuple[FloatArray, IntegerArray]:
+        """Return the parameters (rows: ``_NUMBERS``) and the geometries with which episodes begin."""
+        parameters = np.repeat(self._nominal_numbers, len(keys), axis=1)
+        for name, values in self.task.draws(keys, episodes).items():
+            parameters[_NUMBERS.index(name)] = values
+        return parameters, np.full(len(keys), self._geometry, np.int64)
+
+    def _given(
+        self,
+        which: IntegerArray,
+        keys: IntegerArray,
+        episodes: IntegerArray,
+        per_env: list[dict[str, Any]] | None,
+        parameters: FloatArray,
+        geometries: IntegerArray,
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Put what options say into parameters and geometries; return the starts that they ask for, and for whom."""
+        x, v, placed = np.zeros(len(which)), np.zeros(len(which)), np.zeros(len(which), np.bool_)
+        for place, i in enumerate(which.tolist() if per_env is not None else []):
+            assert per_env is not None
+            options = per_env[i]
+            own = self._as_parameters(parameters[:, place], geometries[place])
+            if "parameters" in options:
+                own = own.replace(**options["parameters"])
+                check_belt(own)
+                parameters[:, place] = [getattr(own, name) for name in _NUMBERS]
+                geometries[place] = own.plant.geometry
+            if any(name in options for name in ("x", "phase", "start")):
+                x[place], v[place] = start_of(self.task, own, options, int(keys[place]), int(episodes[place]))
+                placed[place] = True
+        return x, v, placed
+
+    def _as_parameters(self, numbers: FloatArray, geometry: int) -> OscillatorParameters:
+        values = dict(zip(_NUMBERS, numbers.tolist(), strict=True))
+        return self.nominal.replace(geometry=GEOMETRIES[geometry], **values)
+
+    def _begin(
+        self,
+        which: IntegerArray,
+        parameters: FloatArray,
+        geometries: IntegerArray,
+        x: FloatArray | None = None,
+        v: FloatArray | None = None,
+        placed: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Start episodes with these parameters, at the states (x, v) where ``placed``; observe them."""
+        state, integers = self._state, self._integers
+        self._numbers[:, which] = parameters
+        for name, row in _STATE_ROWS.items():
+            state[row, which] = parameters[_NUMBERS.index(name)]
+        mu_s, mu_m, v_m = (parameters[_NUMBERS.index(name)] for name in ("mu_s", "mu_m", "v_m"))
+        state[kernel.S_K1, which], state[kernel.S_K3, which] = stribeck_coefficients(mu_s, mu_m, v_m)
+        speed = parameters[_NUMBERS.index("belt_speed")]
+        state[kernel.S_BELT, which] = speed
+        state[kernel.S_TRAVEL :, which] = 0.0
+        state[kernel.S_LATE_LOW, which] = np.inf
+        state[kernel.S_LATE_HIGH, which] = -np.inf
+        integers[kernel.I_GEOMETRY, which] = geometries
+        for row in (kernel.I_STEPS, kernel.I_FIRST_STEP, kernel.I_SEEN, kernel.I_OVER):
+            integers[row, which] = 0
+        if self.task.show_parameters:
+            self._shown[which] = self._scaled_parameters(parameters).T
+        if placed is None:
+            self._place(which, parameters)
+        else:
+            assert x is not None
+            assert v is not None
+            state[kernel.S_X, which], state[kernel.S_V, which] = x, v
+            self._place(which[~placed], parameters[:, ~placed])
+        self._observe(which)
+        for i in self._views.keys() & set(which.tolist()):
+            self._views[i].clear_picture()
+
+    def _place(self, which: IntegerArray, parameters: FloatArray) -> None:
+        """Put environments where the task starts its episodes."""
+        if len(which) == 0:
+            return
+        state, task = self._state, self.task
+        keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which]
+        if task.start == "random":
+            state[kernel.S_X, which], state[kernel.S_V, which] = task.random_states(keys, episodes)
+            return
+        geometries = self._integers[kernel.I_GEOMETRY, which]
+        own = (geometries != self._geometry) | (parameters != self._nominal_numbers).any(axis=0)
+        left = which
+        if task.start == "cycle":
+            phases = task.phases(keys, episodes)
+            with announced("starts in a batch"):
+                x, v, period = self._nominal_cycle
+                kernel.cycle_starts(state, self._integers, which[~own], phases[~own], x, v, period, False)
+                unknown = kernel.cycle_starts(state, self._integers, which[own], phases[own], 0.0, 0.0, 0.0, True)
+            left = which[own][unknown == 1]
+        for i in left.tolist():
+            j = int(np.searchsorted(which, i))
+            single = self._as_parameters(parameters[:, j], geometries[j])
+            state[kernel.S_X, i], state[kernel.S_V, i] = task.start_state(single, int(keys[j]), int(episodes[j]))
+
+    @functools.cached_property
+    def _nominal_cycle(self) -> tuple[float, float, float]:
+        """The state at phase 0 of the nominal passive motion, and its period (0 where nothing oscillates)."""
+        cycle = passive_motion(self.nominal)
+        if cycle is not None and cycle.period > 0.0:
+            return cycle.x_phase0, cycle.v_phase0, cycle.period
+        return *self.task.cycle_state(self.nominal, 0.0), 0.0
+
+    def _scaled_parameters(self, parameters: FloatArray) -> FloatArray:
+        limit = self.task.observation_limit
+        rows = []
+        for name, (low, high) in self.task.randomise.items():
+            values = parameters[_NUMBERS.index(name)]
+            scaled = 2.0 * (values - low) / (high - low) - 1.0 if high > low else np.zeros_like(values)
+            rows.append(np.clip(scaled, -limit, limit))
+        return np.array(rows)
+
+    def _observe(self, which: IntegerArray) -> None:
+        kernel.observe(
+            self._task_numbers,
+            self._task_codes,
+            self._state,
+            self._integers,
+            self._past,
+            self._shown,
+            self._observations,
+            which,
+        )
+
+    def _at_start(self, which: IntegerArray) -> dict[str, NDArray[Any]]:
+        """Return what info says of environments (k,) that have just been reset, each (k,)."""
+        state = self._state
+        x, v, v_belt = state[kernel.S_X, which], state[kernel.S_V, which], state[kernel.S_BELT, which]
+        mode, normal_force = np.empty(len(which), np.int64), np.empty(len(which))
+        kernel.contact(state, self._integers, which, mode, normal_force)
+        return {
+            "x": x,
+            "v": v,
+            "v_belt": v_belt,
+            "v_rel": v - v_belt,
+            "mode": mode,
+            "normal_force": normal_force,
+            "time": np.zeros(len(which)),
+        }
+
+    def _reset_info(self, which: IntegerArray, start: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+        info: dict[str, Any] = {}
+        mask = self._mask(which)
+        for name, values in start.items():
+            info[name], info[f"_{name}"] = self._spread(values, which), mask
+        info["parameters"], info["_parameters"] = self._parameters_info(which, mask), mask
+        return info
+
+    def _parameters_info(self, which: IntegerArray, mask: NDArray[np.bool_]) -> dict[str, Any]:
+        geometries = np.full(self.num_envs, None, object)
+        geometries[which] = np.array(GEOMETRIES, object)[self._integers[kernel.I_GEOMETRY, which]]
+        info: dict[str, Any] = {"geometry": geometries, "_geometry": mask}
+        for row, name in enumerate(_NUMBERS):
+            info[name], info[f"_{name}"] = self._spread(self._numbers[row, which], which), mask
+        return info
+
+    def _spread(self, values: NDArray[Any], which: IntegerArray) -> NDArray[Any]:
+        """Return an array (num_envs,) with values (k,) in the places ``which`` and 0 elsewhere."""
+        spread = np.zeros(self.num_envs, values.dtype)
+        spread[which] = values
+        return spread
+
+    def _mask(self, which: IntegerArray) -> NDArray[np.bool_]:
+        if len(which) == self.num_envs:
+            return self._all
+        mask = np.zeros(self.num_envs, np.bool_)
+        mask[which] = True
+        return mask
+
+    # Stepping ---------------------------------------------------------------------------------------------------------
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Hold the actions (num_envs, 1) for one control interval.
+
+        Returns:
+            Observations (num_envs, size), float32; rewards, float64; terminated; truncated; info.
+
+        Raises:
+            TypeError, ValueError: if the actions are not finite numbers of this shape; nothing has then been stepped.
+            gymnasium.error.ResetNeeded: before the first reset; with autoreset_mode "Disabled" also if an
+                environment's episode has ended.
+        """
+        if not self._is_reset:
+            raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
+        forces = self._checked_actions(actions)
+        resting = self._over
+        if len(resting) and self.autoreset_mode == AutoresetMode.DISABLED:
+            raise gym.error.ResetNeeded(
+                f"the episodes of environments {_listed(resting)} have ended: reset them with "
+                "options={'reset_mask': ...} before step()"
+            )
+        out = self._buffers()
+        returns = self._state[kernel.S_RETURN].copy() if self.reward is not None else None
+        with announced("step of a batch"):
+            ended = self._advance(forces, out)
+        n = self.num_envs
+        report, codes = out.report[:, :n], out.codes[:, :n]
+        terminated, truncated = out.over
+        info: dict[str, Any] = dict(self._masks)
+        info.update(zip(_REPORT, report, strict=True))
+        info["mode"], info["events"] = codes[kernel.C_MODE], codes[kernel.C_EVENTS]
+        info["status"] = self._all_ok
+        if ended and codes[kernel.C_STATUS].any():
+            info["status"] = _STATUS_NAMES[codes[kernel.C_STATUS]]
+        if returns is not None:
+            self._replace_rewards(info, resting, out.rewards, returns)
+        if self._views:
+            self._note_for_views(info, resting)
+        if len(resting):
+            self._restart(resting)
+            out.rewards[resting] = 0.0
+            out.over[:, resting] = False
+            self._show_restarted(info, resting, None)
+        if ended or len(resting):
+            over = np.flatnonzero(terminated | truncated)
+            if len(over):
+                info["statistics"], info["_statistics"] = self._statistics(over)
+                if self.autoreset_mode == AutoresetMode.SAME_STEP:
+                    final = self._final(info, over)
+                    del info["statistics"], info["_statistics"]
+                    self._restart(over)
+                    self._show_restarted(info, over, final)
+                    over = over[:0]
+            self._over = over
+        if self.render_mode == "human":
+            self.render()
+        observations = self._observations.copy() if self.copy else self._observations
+        return observations, out.rewards, terminated, truncated, info
+
+    def _checked_actions(self, actions: Any) -> FloatArray:
+        expected = f"actions must be finite numbers in an array of shape ({self.num_envs}, 1)"
+        try:
+            array = np.asarray(actions, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise TypeError(f"{expected}, got {actions!r}") from None
+        if array.shape != (self.num_envs, 1):
+            raise ValueError(f"{expected}, got shape {array.shape}")
+        flat = array.reshape(-1)
+        bad = kernel.first_bad(flat)
+        if bad >= 0:
+            raise ValueError(f"{expected}; outside [-1, 1] they are clipped; environment {bad} got {flat[bad]!r}")
+        return flat
+
+    def _buffers(self) -> _Buffers:
+        if self._kept is not None:
+            return self._kept
+        n, width = self.num_envs, self._width
+        out = _Buffers(
+            np.empty(n),
+            np.empty((2, n), np.bool_),
+            np.empty((kernel.REPORT_ROWS, width)),
+            np.empty((kernel.CODE_ROWS, width), np.int64),
+        )
+        if not self.copy:
+            self._kept = out
+        return out
+
+    def _advance(self, actions: FloatArray, out: _Buffers) -> int:
+        """Step all environments; return how many are at an episode's end."""
+        arguments = (
+            self._task_numbers,
+            self._task_codes,
+            self._state,
+            self._integers,
+            self._past,
+            self._shown,
+            actions,
+            self._observations,
+            *out,
+        )
+        shares = len(self._works)
+        if shares == 1:
+            return int(kernel.STEPPERS[self._geometry](self._works[0], 0, self.num_envs, *arguments))
+        kernel.STEPPERS_IN_THREADS[self._geometry](self._works, self._bounds, self._ended, *arguments)
+        return int(self._ended.sum())
+
+    def _replace_rewards(
+        self, info: dict[str, Any], resting: IntegerArray, rewards: FloatArray, returns: FloatArray
+    ) -> None:
+        assert self.reward is not None
+        columns = {name: info[name].tolist() for name in _STEP_KEYS}
+        quiet = set(resting.tolist())
+        for i in range(self.num_envs):
+            if i not in quiet:
+                rewards[i] = float(self.reward({name: values[i] for name, values in columns.items()}))
+        self._state[kernel.S_RETURN, : self.num_envs] = returns[: self.num_envs] + rewards
+
+    def _restart(self, which: IntegerArray) -> None:
+        """Start the next episodes of environments."""
+        self._integers[kernel.I_EPISODE, which] += 1
+        keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which]
+        self._begin(which, *self._drawn(keys, episodes))
+
+    def _show_restarted(self, info: dict[str, Any], which: IntegerArray, final: dict[str, Any] | None) -> None:
+        """Let info say of environments that they have been reset (after what is ``final``, if they are that far)."""
+        stepped = ~self._mask(which)
+        for name in _ONLY_STEP_KEYS:
+            if not stepped.any():  # nobody has anything to say of a step
+                del info[name], info[f"_{name}"]
+                continue
+            values = info[name]
+            if name == "status":
+                info[name] = values = values.copy()
+            values[which] = None if name == "status" else 0
+            info[f"_{name}"] = stepped
+        for name, start in self._at_start(which).items():
+            info[name][which] = start
+        mask = self._mask(which)
+        info["parameters"], info["_parameters"] = self._parameters_info(which, mask), mask
+        if final is not None:
+            info.update(final)
+
+    def _final(self, info: Mapping[str, Any], which: IntegerArray) -> dict[str, Any]:
+        """Return the last observations and the info of environments that are about to be reset in the same step."""
+        mask = self._mask(which)
+        observations = np.full(self.num_envs, None, object)
+        for i in which.tolist():
+            observations[i] = self._observations[i].copy()
+        last: dict[str, Any] = {"statistics": info["statistics"], "_statistics": mask}
+        for name in _STEP_KEYS:
+            last[f"_{name}"] = mask
+            if name == "status":
+                last[name] = np.full(self.num_envs, None, object)
+                last[name][which] = info[name][which]
+            else:
+                last[name] = self._spread(info[name][which], which)
+        return {"final_obs": observations, "_final_obs": mask, "final_info": last, "_final_info": mask}
+
+    def _statistics(self, which: IntegerArray) -> tuple[dict[str, Any], NDArray[np.bool_]]:
+        """Return what the episodes of environments came to."""
+        state = self._state[:, which]
+        steps = self._integers[kernel.I_STEPS, which] - self._integers[kernel.I_FIRST_STEP, which]
+        late = np.where(state[kernel.S_LATE_TIME] > 0.0, state[kernel.S_LATE_TIME], np.nan)
+        with np.errstate(invalid="ignore"):
+            values = (
+                state[kernel.S_RETURN],
+                steps,
+                amplitude(state[kernel.S_LATE_LOW], state[kernel.S_LATE_HIGH]) + 0.0 * late,
+                state[kernel.S_LATE_STICK] / late,
+                state[kernel.S_VIBRATION],
+                state[kernel.S_EFFORT],
+                state[kernel.S_STICK],
+                state[kernel.S_CONTACT_LOSS],
+            )
+        mask = self._mask(which)
+        statistics: dict[str, Any] = {}
+        for name, entries in zip(EPISODE_STATISTICS, values, strict=True):
+            statistics[name], statistics[f"_{name}"] = self._spread(entries, which), mask
+        return statistics, mask
+
+    def stagger(self) -> None:
+        """Cut the running episodes short, each by another share, so that they do not all end in the same step.
+
+        Environment i is taken to have done i/num_envs of its episode's steps: whoever learns from the batch then sees
+        squealing, settling and settled motion in their due shares from the second episode on.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if not self._is_reset:
+            raise gym.error.ResetNeeded("call reset() before stagger(): no episode is running")
+        steps = self._everyone * self.task.episode_steps // self.num_envs
+        self._integers[kernel.I_STEPS, : self.num_envs] = steps
+        self._integers[kernel.I_FIRST_STEP, : self.num_envs] = steps
+
+    # One by one -------------------------------------------------------------------------------------------------------
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+        """The seeds of the environments; None where none was given."""
+        return tuple(self._seeds)
+
+    def get_states(self) -> tuple[EnvState, ...]:
+        """Return the state of every environment; see :meth:`SDFrictionEnv.get_state`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if not self._is_reset:
+            raise gym.error.ResetNeeded("call reset() before get_states(): there is no state yet")
+        return tuple(self._state_of(i) for i in range(self.num_envs))
+
+    def _state_of(self, i: int) -> EnvState:
+        state, integers = self._state[:, i], self._integers[:, i]
+        memory = self.task.sensor_delay + 1
+        seen = int(integers[kernel.I_SEEN]) if len(self._past) else 0
+        past = [self._past[k % memory, :, i].tolist() for k in range(max(0, seen - memory), seen)]
+        return EnvState(
+            parameters=self._as_parameters(self._numbers[:, i], int(integers[kernel.I_GEOMETRY])),
+            x=float(state[kernel.S_X]),
+            v=float(state[kernel.S_V]),
+            v_belt=float(state[kernel.S_BELT]),
+            belt_travel=float(state[kernel.S_TRAVEL]),
+            steps=int(integers[kernel.I_STEPS]),
+            ended=bool(integers[kernel.I_OVER] == kernel.ENDED),
+            worst_cost=float(state[kernel.S_WORST]),
+            key=int(integers[kernel.I_KEY]),
+            episode=int(integers[kernel.I_EPISODE]),
+            past=tuple((x, v) for x, v in past),
+        )
+
+    def set_states(self, states: Sequence[EnvState]) -> None:
+        """Go back to states that :meth:`get_states` returned: what follows is the same, bit for bit.
+
+        The episodes' statistics begin anew.
+
+        Raises:
+            TypeError, ValueError: if ``states`` are not ``num_envs`` times an :class:`EnvState`.
+        """
+        if len(states) != self.num_envs:
+            raise ValueError(f"states must be {self.num_envs}, one per environment, got {len(states)}")
+        for state in states:
+            if not isinstance(state, EnvState):
+                raise TypeError(f"states must be as get_states() returns them, got {state!r}")
+        for i, state in enumerate(states):
+            self._set_state(i, state)
+
+    def _set_state(self, i: int, state: EnvState) -> None:
+        own, memory = state.parameters, self.task.sensor_delay + 1
+        which = np.array([i])
+        observation = self._observations[i].copy()
+        self._integers[kernel.I_KEY, i], self._integers[kernel.I_EPISODE, i] = state.key, state.episode
+        numbers = np.array([[getattr(own, name)] for name in _NUMBERS])
+        here = (np.array([state.x]), np.array([state.v]), np.array([True]))
+        self._begin(which, numbers, np.array([own.plant.geometry]), *here)
+        self._observations[i] = observation
+        self._state[kernel.S_BELT, i], self._state[kernel.S_TRAVEL, i] = state.v_belt, state.belt_travel
+        self._state[kernel.S_WORST, i] = state.worst_cost
+        self._integers[kernel.I_STEPS, i] = self._integers[kernel.I_FIRST_STEP, i] = state.steps
+        self._integers[kernel.I_OVER, i] = kernel.ENDED if state.ended else kernel.RUNNING
+        if len(self._past):
+            self._integers[kernel.I_SEEN, i] = len(state.past)
+            for k, pair in enumerate(state.past[-memory:]):
+                self._past[k, :, i] = pair
+        if not state.ended:
+            self._over = self._over[self._over != i]
+        self._is_reset = True
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method of every environment, or read an attribute; return the results.
+
+        A single environment in the place of each is asked, and what the call changes in its state is kept.
+
+        Raises:
+            AttributeError: if an environment has nothing of that name.
+        """
+        if name in self._attributes:
+            return tuple(self._attributes[name])
+        single = self._single
+        if not self._is_reset:
+            result = getattr(single, name)
+            return tuple(result(*args, **kwargs) if callable(result) else result for _ in range(self.num_envs))
+        results = []
+        for i in range(self.num_envs):
+            before = self._state_of(i)
+            single.set_state(before)
+            result = getattr(single, name)
+            results.append(result(*args, **kwargs) if callable(result) else result)
+            after = single.get_state()
+            if after != before:
+                self._set_state(i, after)
+        return tuple(results)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute of every environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of every environment, from a list or tuple of ``num_envs`` values or one for all.
+
+        Raises:
+            ValueError: if there are not ``num_envs`` values.
+            AttributeError: if environments have an attribute of that name already: it holds for the whole batch, and
+                is given to the constructor, or to reset() in its options.
+        """
+        listed = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
+        if len(listed) != self.num_envs:
+            raise ValueError(f"values must be {self.num_envs}, one per environment, got {len(listed)}")
+        if hasattr(self._single, name):
+            raise AttributeError(
+                f"{name!r} cannot be set: parameters and tasks are given to the constructor or to reset(options=...)"
+            )
+        self._attributes[name] = listed
+
+    # Pictures ---------------------------------------------------------------------------------------------------------
+
+    def _note_for_views(self, info: Mapping[str, Any], resting: IntegerArray) -> None:
+        for i, view in self._views.items():
+            if i not in resting:
+                seen = (float(info["x_min"][i]), float(info["x_max"][i]), float(info["stick_fraction"][i]))
+                view.note_for_picture(*seen, float(info["force"][i]))
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Draw the environments ``render_envs``; a tuple of arrays (height, width, 3), uint8, in mode "rgb_array"."""
+        if self.render_mode is None:
+            gym.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array' or 'human'")
+            return None
+        frames = []
+        for i, view in self._views.items():
+            if self._is_reset:
+                view.set_state(self._state_of(i))
+            frames.append(view.render())
+        return tuple(frames) if self.render_mode == "rgb_array" else None
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the windows, if there are any."""
+        for view in self._views.values():
+            view.close()
+        self._single.close()
+
+
+def _task_arrays(task: Task) -> tuple[FloatArray, IntegerArray]:
+    """Return what compiled code needs of a task that holds for the whole batch."""
+    numbers = np.zeros(kernel.TASK_NUMBERS)
+    numbers[kernel.T_AUTHORITY] = task.authority
+    numbers[kernel.T_A_LIMIT] = task.belt_acceleration_limit
+    numbers[kernel.T_INTERVAL] = task.control_interval
+    numbers[kernel.T_W_EFFORT] = task.w_effort
+    numbers[kernel.T_W_STICK] = task.w_stick
+    numbers[kernel.T_CONTACT_LOSS_COST] = task.contact_loss_cost
+    numbers[kernel.T_LIMIT] = task.observation_limit
+    numbers[kernel.T_X_OFFSET] = task.x_offset
+    numbers[kernel.T_X_SCALE] = task.x_scale
+    numbers[kernel.T_V_SCALE] = task.v_scale
+    numbers[kernel.T_BELT_AUTHORITY] = task.belt_authority or 1.0
+    numbers[kernel.T_SENSOR_NOISE] = task.sensor_noise
+    codes = np.zeros(kernel.TASK_CODES, np.int64)
+    codes[kernel.T_ACTUATOR] = ACTUATOR_CODES[task.actuator]
+    codes[kernel.T_EPISODE_STEPS] = task.episode_steps
+    codes[kernel.T_LATE_STEPS] = task.late_steps
+    codes[kernel.T_FULL_STATE] = task.sensor == "state"
+    codes[kernel.T_SEES_BELT] = task.sensor == "state" and task.actuator == "belt_speed"
+    codes[kernel.T_SENSOR_DELAY] = task.sensor_delay
+    return numbers, codes
+
+
+def _views(
+    single: SDFrictionEnv, render_envs: Iterable[int] | None, num_envs: int, render_mode: str | None
+) -> dict[int, SDFrictionEnv]:
+    """Return the single environments that draw, by the place they draw."""
+    if render_envs is None:
+        chosen = list(range(min(num_envs, _MOST_RENDERED if render_mode == "rgb_array" else 1)))
+    else:
+        chosen = [_whole("render_envs", i, 0, num_envs - 1) for i in render_envs]
+        if len(set(chosen)) < len(chosen) or (render_mode == "human" and len(chosen) != 1):
+            raise ValueError(f"render_envs must name each environment once, and one for 'human', got {chosen!r}")
+    if render_mode is None:
+        return {}
+    return {i: single.twin() for i in chosen}
+
+
+def _whole(name: str, value: Any, low: int, high: int) -> int:
+    number = checked_number(name, value, low, high)
+    if number != int(number):
+        raise ValueError(f"{name} must be a whole number in [{low}, {high}], got {value!r}")
+    return int(number)
+
+
+def _listed(places: IntegerArray) -> str:
+    return ", ".join(map(str, places[:5].tolist())) + (", ..." if len(places) > 5 else "")
+
+
+def _checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
+    """Return the seed of every environment.
+
+    Raises:
+        TypeError, ValueError: if ``seed`` is neither None, a whole number, nor ``num_envs`` of these.
+    """
+    if seed is None:
+        return [None] * num_envs
+    if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
+        if len(seed) != num_envs:
+            raise ValueError(f"seed must hold {num_envs} seeds, one per environment, got {len(seed)}")
+        return [None if single is None else _checked_seed(single) for single in seed]
+    first = _checked_seed(seed)
+    return [first + i for i in range(num_envs)]
+
+
+def _checked_seed(seed: Any) -> int:
+    if isinstance(seed, bool | np.bool_) or not isinstance(seed, int | np.integer):
+        raise TypeError(f"seed must be None, a whole number or a sequence of these, got {seed!r}")
+    if seed < 0:
+        raise ValueError(f"seed must be at least 0, got {seed!r}")
+    return int(seed)
+
+
+def _entry(name: str, value: Any, i: int, num_envs: int) -> Any:
+    """Return what a value says of environment i: its entry if it is an array, or else the value."""
+    if isinstance(value, np.ndarray | list | tuple):
+        if len(value) != num_envs or np.ndim(value) != 1:
+            raise ValueError(f"{name} must be one value or {num_envs}, got shape {np.shape(value)}")
+        value = value[i]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _checked_batch_options(options: Any, num_envs: int) -> tuple[NDArray[np.bool_] | None, list[dict[str, Any]] | None]:
+    """Return who is reset (None: all) and the checked options of each environment (None: no options).
+
+    Raises:
+        TypeError, ValueError: naming the option, its value and what is allowed.
+    """
+    if options is None:
+        return None, None
+    if not isinstance(options, Mapping):
+        raise TypeError(f"options must be a mapping or None, got {options!r}")
+    given = dict(options)
+    mask = given.pop("reset_mask", None)
+    if mask is not None:
+        expected = f"options['reset_mask'] must be a boolean array of shape ({num_envs},) with a True in it"
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+            raise TypeError(f"{expected}, got {mask!r}")
+        if mask.shape != (num_envs,) or not mask.any():
+            raise ValueError(f"{expected}, got shape {mask.shape} with {mask.sum()} True")
+    if not given:
+        return mask, None
+    parameters = given.get("parameters")
+    if isinstance(parameters, Sequence) and not isinstance(parameters, str) and len(parameters) != num_envs:
+        raise ValueError(f"options['parameters'] must be a mapping or {num_envs} of them, got {len(parameters)}")
+    per_env = []
+    for i in range(num_envs):
+        single = {name: _entry(f"options[{name!r}]", value, i, num_envs) for name, value in given.items()}
+        if isinstance(single.get("parameters"), Mapping):
+            single["parameters"] = {
+                name: _entry(f"options['parameters'][{name!r}]", value, i, num_envs)
+                for name, value in single["parameters"].items()
+            }
+        per_env.append(checked_options(single))
+    return mask, per_env

@@ -1316,23 +1316,23 @@ _LOOK = 19  # and the eight after it
 ) = range(21)
 STATE_ROWS = 21
 # ... and whole numbers.
-I_GEOMETRY, I_STEPS, I_KEY, I_EPISODE, I_SEEN, I_OVER, I_FIRST_STEP = 0, 1, 2, 3, 4, 5, 6
-INTEGER_ROWS = 7
+I_GEOMETRY, I_STEPS, I_KEY, I_EPISODE, I_SEEN, I_OVER, I_FIRST_STEP, I_STATUS = 0, 1, 2, 3, 4, 5, 6, 7
+INTEGER_ROWS = 8
 RUNNING, TRUNCATED, ENDED = 0, 1, 2  # what I_OVER says
 
-# What a step reports of each environment, floats ...
+# What a step can report of each environment, floats ...
 (
     O_X,
     O_V,
     O_BELT,
-    O_V_REL,
     O_NORMAL,
-    O_TIME,
     O_ACTION,
     O_FORCE,
     O_A_BELT,
     O_X_MIN,
     O_X_MAX,
+    O_V_REL,
+    O_TIME,
     O_MEAN_V2,
     O_STICK_FRACTION,
     O_FRICTION_POWER,
@@ -1342,10 +1342,17 @@ RUNNING, TRUNCATED, ENDED = 0, 1, 2  # what I_OVER says
     O_STICK,
     O_CONTACT_LOSS,
 ) = range(19)
-REPORT_ROWS = 19
 # ... and whole numbers.
-C_MODE, C_EVENTS, C_STATUS = 0, 1, 2  # in the order of the work space
-CODE_ROWS = 3
+C_MODE, C_EVENTS = 0, 1
+# Rows of the second work space once it is free again, after what goes in: from O_V_REL on the report's, and two more.
+_Q_V_REL, _Q_TIME, _Q_MEAN_V2, _Q_STICK_FRACTION, _Q_FRICTION_POWER, _Q_CONTROL_POWER = 13, 14, 15, 16, 17, 18
+_Q_VIBRATION, _Q_EFFORT, _Q_STICK, _Q_CONTACT_LOSS, _Q_REWARD, _Q_WAY = 19, 20, 21, 22, 23, 24
+# Where in both work spaces a reported row stands.
+_REPORTED = (
+    *(_X_END, _V_END, _BELT_END, _NORMAL, _ACTION, _U, _A_BELT, _X_MIN, _X_MAX),
+    *(_WORK_ROWS + row for row in range(_Q_V_REL, _Q_CONTACT_LOSS + 1)),
+)
+
 
 # Numbers that hold for the whole batch.
 (
@@ -1363,8 +1370,8 @@ CODE_ROWS = 3
     T_SENSOR_NOISE,
 ) = range(12)
 TASK_NUMBERS = 12
-T_ACTUATOR, T_EPISODE_STEPS, T_LATE_STEPS, T_FULL_STATE, T_SEES_BELT, T_SENSOR_DELAY = 0, 1, 2, 3, 4, 5
-TASK_CODES = 6
+T_ACTUATOR, T_EPISODE_STEPS, T_LATE_STEPS, T_FULL_STATE, T_SEES_BELT, T_SENSOR_DELAY, T_ONE_PLANT = 0, 1, 2, 3, 4, 5, 6
+TASK_CODES = 7
 
 
 # The cache would take it for slip_step itself.
@@ -1455,13 +1462,8 @@ def _stick_lane(geometry, w, i, interval):
     dx, int_v2, int_fv = _ride(plant, x, belt, a_belt, u, interval)
     x_end = x + dx
     w[_X_END * STRIDE + i] = x_end
-    w[_V_END * STRIDE + i] = belt_end
     w[_BELT_END * STRIDE + i] = belt_end
-    w[_MODE * STRIDE + i] = 0.0
-    w[_EVENTS * STRIDE + i] = 0.0
-    w[_STATUS * STRIDE + i] = 0.0
     w[_INT_V2 * STRIDE + i] = int_v2
-    w[_STICK_TIME * STRIDE + i] = interval
     w[_INT_FV * STRIDE + i] = 0.0 + int_fv
     w[_X_MIN * STRIDE + i] = x_end if x_end < x else x
     w[_X_MAX * STRIDE + i] = x_end if x_end > x else x
@@ -1501,23 +1503,34 @@ def _look_lane(geometry, w, i):
 
 
 @compiled
-def _bring(w, i, sub, n):
+def _bring(w, i, sub, n, one_plant):
     """Copy what goes into lane i to lane n of the second work space."""
-    for row in range(_ACTION):
+    for row in range(_X if one_plant else 0, _ACTION):
         sub[row * STRIDE + n] = w[row * STRIDE + i]
     sub[_U * STRIDE + n] = w[_U * STRIDE + i]
     sub[_A_BELT * STRIDE + n] = w[_A_BELT * STRIDE + i]
 
 
 @compiled
-def _give_back(sub, n, w, i):
-    """Copy what came out of lane n of the second work space to lane i."""
-    for row in range(_X_END, _DONE_FAST + 1):
-        w[row * STRIDE + i] = sub[row * STRIDE + n]
+def _give_back(sub, n, w, i, interval):
+    """Copy what came of a stuck lane n of the second work space to lane i."""
+    w[_X_END * STRIDE + i] = sub[_X_END * STRIDE + n]
+    w[_V_END * STRIDE + i] = sub[_BELT_END * STRIDE + n]
+    w[_BELT_END * STRIDE + i] = sub[_BELT_END * STRIDE + n]
+    w[_MODE * STRIDE + i] = STICK
+    w[_EVENTS * STRIDE + i] = 0.0
+    w[_STATUS * STRIDE + i] = OK
+    w[_INT_V2 * STRIDE + i] = sub[_INT_V2 * STRIDE + n]
+    w[_STICK_TIME * STRIDE + i] = interval
+    w[_INT_FV * STRIDE + i] = sub[_INT_FV * STRIDE + n]
+    w[_X_MIN * STRIDE + i] = sub[_X_MIN * STRIDE + n]
+    w[_X_MAX * STRIDE + i] = sub[_X_MAX * STRIDE + n]
+    w[_NORMAL * STRIDE + i] = sub[_NORMAL * STRIDE + n]
+    w[_DONE_FAST * STRIDE + i] = sub[_DONE_FAST * STRIDE + n]
 
 
 @compiled
-def _wants_look(w, i, sub, n, interval):
+def _wants_look(w, i, sub, n, interval, one_plant):
     """Whether the slip step of lane i lands or turns in the plainest way; if so, tell lane n of the second work space
     where. The tests are those of :func:`slip_until_event`."""
     x = w[_X * STRIDE + i]
@@ -1543,7 +1556,7 @@ def _wants_look(w, i, sub, n, interval):
         t = _closing_guess(side * v, side * a, side * v_end, side * a_end, interval)
     else:
         return False
-    _bring(w, i, sub, n)
+    _bring(w, i, sub, n, one_plant)
     sub[_L_TIME * STRIDE + n] = t
     sub[_L_SIDE * STRIDE + n] = side
     sub[_L_LEVEL * STRIDE + n] = level
@@ -1681,19 +1694,13 @@ def first_bad(actions):
     return -1
 
 
-# Rows of the second work space once it is free again: the report's, in its order, and two more.
-_Q_REWARD, _Q_WAY = REPORT_ROWS, REPORT_ROWS + 1
-
-
 @compiled
 def _weigh_lanes(w, q, m, interval, w_effort, w_stick):
     for i in range(m):
-        x_end = w[_X_END * STRIDE + i]
-        v_end = w[_V_END * STRIDE + i]
         belt_end = w[_BELT_END * STRIDE + i]
         mean_v2, stick_fraction, friction_power, control_power, vibration, effort, stick = _weighed(
             w[_X * STRIDE + i],
-            x_end,
+            w[_X_END * STRIDE + i],
             w[_INT_V2 * STRIDE + i],
             w[_STICK_TIME * STRIDE + i],
             w[_INT_FV * STRIDE + i],
@@ -1704,74 +1711,52 @@ def _weigh_lanes(w, q, m, interval, w_effort, w_stick):
             w_effort,
             w_stick,
         )
-        q[O_X * STRIDE + i] = x_end
-        q[O_V * STRIDE + i] = v_end
-        q[O_BELT * STRIDE + i] = belt_end
-        q[O_V_REL * STRIDE + i] = v_end - belt_end
-        q[O_NORMAL * STRIDE + i] = w[_NORMAL * STRIDE + i]
-        q[O_TIME * STRIDE + i] = 0.0
-        q[O_ACTION * STRIDE + i] = w[_ACTION * STRIDE + i]
-        q[O_FORCE * STRIDE + i] = w[_U * STRIDE + i]
-        q[O_A_BELT * STRIDE + i] = w[_A_BELT * STRIDE + i]
-        q[O_X_MIN * STRIDE + i] = w[_X_MIN * STRIDE + i]
-        q[O_X_MAX * STRIDE + i] = w[_X_MAX * STRIDE + i]
-        q[O_MEAN_V2 * STRIDE + i] = mean_v2
-        q[O_STICK_FRACTION * STRIDE + i] = stick_fraction
-        q[O_FRICTION_POWER * STRIDE + i] = friction_power
-        q[O_CONTROL_POWER * STRIDE + i] = control_power
-        q[O_VIBRATION * STRIDE + i] = vibration
-        q[O_EFFORT * STRIDE + i] = effort
-        q[O_STICK * STRIDE + i] = stick
-        q[O_CONTACT_LOSS * STRIDE + i] = 0.0
+        q[_Q_V_REL * STRIDE + i] = w[_V_END * STRIDE + i] - belt_end
+        q[_Q_MEAN_V2 * STRIDE + i] = mean_v2
+        q[_Q_STICK_FRACTION * STRIDE + i] = stick_fraction
+        q[_Q_FRICTION_POWER * STRIDE + i] = friction_power
+        q[_Q_CONTROL_POWER * STRIDE + i] = control_power
+        q[_Q_VIBRATION * STRIDE + i] = vibration
+        q[_Q_EFFORT * STRIDE + i] = effort
+        q[_Q_STICK * STRIDE + i] = stick
+        q[_Q_CONTACT_LOSS * STRIDE + i] = 0.0
         q[_Q_REWARD * STRIDE + i] = vibration + effort + stick
         q[_Q_WAY * STRIDE + i] = 0.5 * (w[_BELT * STRIDE + i] + belt_end) * interval
 
 
 @compiled
-def _account(task, codes, state, integers, w, q, rewards, over, report, report_codes, first, m, failures):
+def _account(task, codes, state, integers, work, wanted, rewards, over, report, report_codes, first, m, failures):
     """Write down what a block's step came to; return how many of its environments ended their episode."""
     # Every row is cut out first and then counted from 0, which is what vector instructions need.
     interval = task[T_INTERVAL]
     last_step = codes[T_EPISODE_STEPS]
     late_steps = codes[T_LATE_STEPS]
+    w = work[: _WORK_ROWS * STRIDE]
+    q = work[_WORK_ROWS * STRIDE :]
     _weigh_lanes(w, q, m, interval, task[T_W_EFFORT], task[T_W_STICK])
-    for row in range(REPORT_ROWS):
-        place = report[row, first : first + m]
-        for i in range(m):
-            place[i] = q[row * STRIDE + i]
-    for row in range(CODE_ROWS):
-        code = report_codes[row, first : first + m]
-        for i in range(m):
-            code[i] = int(w[(_MODE + row) * STRIDE + i])
     for row in range(3):
         place = state[S_X + row, first : first + m]
         for i in range(m):
-            place[i] = q[(O_X + row) * STRIDE + i]
+            place[i] = w[(_X_END + row) * STRIDE + i]
     for row in range(3):
         place = state[S_VIBRATION + row, first : first + m]
         for i in range(m):
-            place[i] += q[(O_VIBRATION + row) * STRIDE + i]
+            place[i] += q[(_Q_VIBRATION + row) * STRIDE + i]
     travel = state[S_TRAVEL, first : first + m]
     for i in range(m):
         travel[i] += q[_Q_WAY * STRIDE + i]
-    total = state[S_RETURN, first : first + m]
     worst = state[S_WORST, first : first + m]
-    reward = rewards[first : first + m]
-    for i in range(m):
-        reward[i] = q[_Q_REWARD * STRIDE + i]
     for i in range(m):
         cost = -q[_Q_REWARD * STRIDE + i]
         worst[i] = cost if cost > worst[i] else worst[i]
     steps = integers[I_STEPS, first : first + m]
-    time = report[O_TIME, first : first + m]
     terminated = over[0, first : first + m]
     truncated = over[1, first : first + m]
     late = 0
     ended = 0
     for i in range(m):
         steps[i] += 1
-    for i in range(m):
-        time[i] = steps[i] * interval
+        q[_Q_TIME * STRIDE + i] = steps[i] * interval
     for i in range(m):
         terminated[i] = False
     for i in range(m):
@@ -1781,33 +1766,48 @@ def _account(task, codes, state, integers, w, q, rewards, over, report, report_c
     for i in range(m):
         ended += 1 if steps[i] >= last_step else 0
     if late > 0:
-        for i in range(first, first + m):
-            if integers[I_STEPS, i] > codes[T_LATE_STEPS]:
-                state[S_LATE_LOW, i] = min(state[S_LATE_LOW, i], report[O_X_MIN, i])
-                state[S_LATE_HIGH, i] = max(state[S_LATE_HIGH, i], report[O_X_MAX, i])
-                state[S_LATE_STICK, i] += report[O_STICK_FRACTION, i]
-                state[S_LATE_TIME, i] += 1.0
+        for i in range(m):
+            if steps[i] > late_steps:
+                j = first + i
+                state[S_LATE_LOW, j] = min(state[S_LATE_LOW, j], w[_X_MIN * STRIDE + i])
+                state[S_LATE_HIGH, j] = max(state[S_LATE_HIGH, j], w[_X_MAX * STRIDE + i])
+                state[S_LATE_STICK, j] += q[_Q_STICK_FRACTION * STRIDE + i]
+                state[S_LATE_TIME, j] += 1.0
     if ended > 0:
-        for i in range(first, first + m):
-            if over[1, i]:
-                integers[I_OVER, i] = TRUNCATED
+        for i in range(m):
+            if truncated[i]:
+                integers[I_OVER, first + i] = TRUNCATED
     if failures > 0:
-        for i in range(first, first + m):
-            status = report_codes[C_STATUS, i]
+        for i in range(m):
+            status = int(w[_STATUS * STRIDE + i])
             if status != OK:
-                ended += 0 if over[1, i] else 1
-                integers[I_OVER, i] = ENDED
+                ended += 0 if truncated[i] else 1
+                integers[I_OVER, first + i] = ENDED
+                integers[I_STATUS, first + i] = status
                 if status != CONTACT_LOST:
-                    over[1, i] = True
+                    truncated[i] = True
                     continue
-                over[0, i] = True
-                steps_left = max(0, last_step - integers[I_STEPS, i]) + 1
-                loss = -steps_left * max(task[T_CONTACT_LOSS_COST], state[S_WORST, i])
-                report[O_CONTACT_LOSS, i] = loss
-                state[S_CONTACT_LOSS, i] += loss
-                rewards[i] += loss
+                terminated[i] = True
+                steps_left = max(0, last_step - steps[i]) + 1
+                loss = -steps_left * max(task[T_CONTACT_LOSS_COST], worst[i])
+                q[_Q_CONTACT_LOSS * STRIDE + i] = loss
+                q[_Q_REWARD * STRIDE + i] += loss
+                state[S_CONTACT_LOSS, first + i] += loss
+    total = state[S_RETURN, first : first + m]
+    reward = rewards[first : first + m]
     for i in range(m):
-        total[i] += reward[i]
+        reward[i] = q[_Q_REWARD * STRIDE + i]
+    for i in range(m):
+        total[i] += q[_Q_REWARD * STRIDE + i]
+    for j in range(len(wanted)):
+        source = _REPORTED[wanted[j]] * STRIDE
+        place = report[j, first : first + m]
+        for i in range(m):
+            place[i] = work[source + i]
+    for row in range(len(report_codes)):
+        code = report_codes[row, first : first + m]
+        for i in range(m):
+            code[i] = int(w[(_MODE + row) * STRIDE + i])
     return ended
 
 
@@ -1819,28 +1819,43 @@ def _observe_block(task, codes, w, shown, observations, first, m):
     x_scale = task[T_X_SCALE]
     v_scale = task[T_V_SCALE]
     authority = task[T_BELT_AUTHORITY]
-    block = observations[first : first + m]
+    size = observations.shape[1]
+    block = observations[first : first + m].reshape(-1)
+    if size == 2 and codes[T_FULL_STATE]:
+        for i in range(m):  # with both in one loop, and 2 in plain sight, these are vector instructions
+            block[2 * i] = _observed(w[_X_END * STRIDE + i], x_offset, x_scale, limit)
+            block[2 * i + 1] = _observed(w[_V_END * STRIDE + i], 0.0, v_scale, limit)
+        return
     for i in range(m):
-        block[i, 0] = _observed(w[_X_END * STRIDE + i], x_offset, x_scale, limit)
+        block[size * i] = _observed(w[_X_END * STRIDE + i], x_offset, x_scale, limit)
     place = 1
     if codes[T_FULL_STATE]:
         for i in range(m):
-            block[i, 1] = _observed(w[_V_END * STRIDE + i], 0.0, v_scale, limit)
+            block[size * i + 1] = _observed(w[_V_END * STRIDE + i], 0.0, v_scale, limit)
         place = 2
     if codes[T_SEES_BELT]:
         for i in range(m):
             modulation = w[_BELT_END * STRIDE + i] / w[_BELT_SPEED * STRIDE + i]
-            block[i, place] = _observed(modulation, 1.0, authority, limit)
+            block[size * i + place] = _observed(modulation, 1.0, authority, limit)
         place += 1
     for i in range(m):
         for j in range(shown.shape[1]):
-            block[i, place + j] = shown[first + i, j]
+            block[size * i + place + j] = shown[first + i, j]
+
+
+@compiled
+def fill_plant(work, state):
+    """Put one environment's plant and belt speed, from its column of the state, into all lanes of both work spaces."""
+    for row in range(_X):
+        for i in range(STRIDE):
+            work[row * STRIDE + i] = state[row]
+            work[(_WORK_ROWS + row) * STRIDE + i] = state[row]
 
 
 @compiled
 def _fill(w, task, codes, state, actions, first, m):
-    """Fill a block's work space with what goes into its step."""
-    for row in range(_ACTION):
+    """Fill a block's work space with what goes into its step (the plant is there already if all have the same)."""
+    for row in range(_X if codes[T_ONE_PLANT] else 0, _ACTION):
         source = state[row, first : first + m]
         for i in range(m):
             w[row * STRIDE + i] = source[i]
@@ -1871,11 +1886,13 @@ def _stepper(geometry):
     It takes
 
         work: (WORK_SIZE,), this call's own. start, end: which environments to step.
-        task (12,), codes (6,): what holds for the whole batch. state (21, n), integers (7, n): of each environment;
-            rows as named above. past, shown: see :func:`observe`.
+        task (12,), codes (7,): what holds for the whole batch. state (21, n), integers (8, n): of each environment;
+            rows as named above. past, shown: see :func:`observe`. With T_ONE_PLANT the plant and its belt speed stand
+            in both halves of ``work`` already.
         actions: (n,), finite; outside [-1, 1] they are clipped.
-        observations (n, size), rewards (n,), over (2, n) (terminated, truncated), report (19, n) and report_codes
-            (3, n): written.
+        wanted: (k,), which rows of the report are.
+        observations (n, size), rewards (n,), over (2, n) (terminated, truncated), report (k, n) and report_codes
+            (2, n) or (0, n): written.
 
     and returns how many of them ended their episode. The law of a step is :func:`control_interval`'s.
     """
@@ -1892,6 +1909,7 @@ def _stepper(geometry):
         past,
         shown,
         actions,
+        wanted,
         observations,
         rewards,
         over,
@@ -1901,6 +1919,7 @@ def _stepper(geometry):
         interval = task[T_INTERVAL]
         w = work[: _WORK_ROWS * STRIDE]
         sub = work[_WORK_ROWS * STRIDE :]
+        one_plant = codes[T_ONE_PLANT] == 1
         plain = task[T_SENSOR_NOISE] == 0.0 and codes[T_SENSOR_DELAY] == 0
         ended = 0
         for first in range(start, end, LANES):
@@ -1922,14 +1941,14 @@ def _stepper(geometry):
                 n = 0
                 for i in range(m):
                     if w[_V * STRIDE + i] == w[_BELT * STRIDE + i]:
-                        _bring(w, i, sub, n)
+                        _bring(w, i, sub, n, one_plant)
                         n += 1
                 for i in range(_whole(n)):
                     _stick_lane(geometry, sub, i, interval)
                 n = 0
                 for i in range(m):
                     if w[_V * STRIDE + i] == w[_BELT * STRIDE + i]:
-                        _give_back(sub, n, w, i)
+                        _give_back(sub, n, w, i, interval)
                         n += 1
             failures = 0
             n = 0
@@ -1939,7 +1958,7 @@ def _stepper(geometry):
                 elif w[_DONE_FAST * STRIDE + i] == 0.0:
                     if not fast or w[_V * STRIDE + i] == w[_BELT * STRIDE + i]:
                         failures += _lane_by_events(geometry, w, i, interval, NOTHING_KNOWN)
-                    elif _wants_look(w, i, sub, n, interval):
+                    elif _wants_look(w, i, sub, n, interval, one_plant):
                         n += 1
                     else:
                         failures += _lane_after_trial(geometry, w, i, sub, 0, interval, 1.0)
@@ -1950,7 +1969,7 @@ def _stepper(geometry):
                 for j in range(n):
                     failures += _lane_after_trial(geometry, w, int(sub[_L_LANE * STRIDE + j]), sub, j, interval, 2.0)
             ended += _account(
-                task, codes, state, integers, w, sub, rewards, over, report, report_codes, first, m, failures
+                task, codes, state, integers, work, wanted, rewards, over, report, report_codes, first, m, failures
             )
             if plain:
                 _observe_block(task, codes, w, shown, observations, first, m)

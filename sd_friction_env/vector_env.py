@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -22,7 +22,7 @@ from sd_friction_env.env import (
     checked_options,
     start_of,
 )
-from sd_friction_env.parameters import GEOMETRIES, RANGES, OscillatorParameters, checked_number
+from sd_friction_env.parameters import GEOMETRIES, RANGES, OscillatorParameters, checked_choice, checked_number
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.startup import announced
 from sd_friction_env.task import FloatArray, IntegerArray, Task, passive_motion
@@ -33,31 +33,33 @@ _MOST_THREADS = 256
 _ENVS_WORTH_A_THREAD = 512
 _MOST_RENDERED = 16
 
-_REPORT = (
-    "x",
-    "v",
-    "v_belt",
-    "v_rel",
-    "normal_force",
-    "time",
-    "action",
-    "force",
-    "belt_acceleration",
-    "x_min",
-    "x_max",
-    "mean_square_velocity",
-    "stick_fraction",
-    "friction_power",
-    "control_power",
-    "reward_vibration",
-    "reward_effort",
-    "reward_stick",
-    "reward_contact_loss",
-)
-_STEP_KEYS = (*_REPORT, "mode", "events", "status")
-_STATUS_NAMES = np.array([kernel.STATUS_NAMES[code] for code in sorted(kernel.STATUS_NAMES)], object)
+REWARD_TERMS = ("reward_vibration", "reward_effort", "reward_stick", "reward_contact_loss")
+_REPORT = {
+    "x": kernel.O_X,
+    "v": kernel.O_V,
+    "v_belt": kernel.O_BELT,
+    "v_rel": kernel.O_V_REL,
+    "normal_force": kernel.O_NORMAL,
+    "time": kernel.O_TIME,
+    "action": kernel.O_ACTION,
+    "force": kernel.O_FORCE,
+    "belt_acceleration": kernel.O_A_BELT,
+    "x_min": kernel.O_X_MIN,
+    "x_max": kernel.O_X_MAX,
+    "mean_square_velocity": kernel.O_MEAN_V2,
+    "stick_fraction": kernel.O_STICK_FRACTION,
+    "friction_power": kernel.O_FRICTION_POWER,
+    "control_power": kernel.O_CONTROL_POWER,
+    "reward_vibration": kernel.O_VIBRATION,
+    "reward_effort": kernel.O_EFFORT,
+    "reward_stick": kernel.O_STICK,
+    "reward_contact_loss": kernel.O_CONTACT_LOSS,
+}
+_CODES = {"mode": kernel.C_MODE, "events": kernel.C_EVENTS}
+_STEP_KEYS = (*_REPORT, *_CODES, "status")
 _RESET_KEYS = ("x", "v", "v_belt", "v_rel", "mode", "normal_force", "time")
-_ONLY_STEP_KEYS = tuple(name for name in _STEP_KEYS if name not in _RESET_KEYS)
+INFO_KEYS = (*_STEP_KEYS, "parameters")
+_STATUS_NAMES = np.array([kernel.STATUS_NAMES[code] for code in sorted(kernel.STATUS_NAMES)], object)
 _NUMBERS = tuple(RANGES)  # the numeric fields of OscillatorParameters
 _STATE_ROWS = {
     "alpha": kernel.S_ALPHA,
@@ -104,7 +106,9 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     ## Info
 
     A dictionary of arrays as Gymnasium's own vector environments have it: beside each array "name" stands a mask
-    "_name". All masks that are true throughout are one read-only array. When episodes end, ``statistics`` holds their
+    "_name" (all masks that are true throughout are one read-only array). ``reset`` tells everything; a step tells the
+    ``info_keys``, by default the reward's terms and the status, for at this speed all else costs more than it is worth
+    to most: ``info_keys="all"`` tells what the single environment tells. When episodes end, ``statistics`` holds their
     return, length, late amplitude and so on (see :class:`SDFrictionEnv`).
 
     ## Arguments
@@ -116,6 +120,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     threads: how many threads may share a step, in [1, 256]; batches of fewer than 512 environments per thread use
         fewer. More than 1 pays where that many cores are idle.
     copy: True hands out new arrays at every step. False: they are overwritten by the next step (a little faster).
+    info_keys: "all", or which names of the single environment's info a step tells; "parameters" among them tells the
+        parameters of episodes that begin.
     render_mode: "rgb_array" (:meth:`render` returns a tuple of frames) or "human" (a window for one environment).
     render_envs: which environments are drawn; None: the first 16 (of "human": the first).
 
@@ -136,6 +142,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         render_mode: str | None = None,
         render_envs: Iterable[int] | None = None,
         reward: RewardFunction | None = None,
+        info_keys: Sequence[str] | Literal["all"] = (*REWARD_TERMS, "status"),
         **task_arguments: Any,
     ) -> None:
         super().__init__()
@@ -152,6 +159,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             raise TypeError(f"copy must be True or False, got {copy!r}")
         self.copy = copy
         self._single = SDFrictionEnv(parameters, render_mode=render_mode, reward=reward, **task_arguments)
+        self.info_keys = _checked_info_keys(info_keys)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.nominal = self._single.nominal
@@ -175,6 +183,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self._shown = np.zeros((n, len(task.randomise) if task.show_parameters else 0))
         shares = max(1, min(self.threads, n // _ENVS_WORTH_A_THREAD))
         self._works = np.ones((shares, kernel.WORK_SIZE))
+        self._own = np.zeros(n, np.bool_)  # who has other parameters than the nominal ones
         # Every share but the last is made of whole blocks.
         blocks = -(-n // kernel.LANES)
         self._bounds = np.minimum(kernel.LANES * (np.arange(shares + 1) * blocks // shares), n)
@@ -189,7 +198,14 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self._all_ok = np.full(n, kernel.STATUS_NAMES[kernel.OK], object)
         for shared in (self._all, self._all_ok):
             shared.setflags(write=False)
-        self._masks = {f"_{name}": self._all for name in _STEP_KEYS}
+        # What is reported: all that the info holds, a reward function reads or a picture shows.
+        self._step_keys = tuple(name for name in _STEP_KEYS if name in self.info_keys)
+        pictured = ("x_min", "x_max", "stick_fraction", "force") if render_mode is not None else ()
+        needed = set(_STEP_KEYS if reward is not None else (*self._step_keys, *pictured))
+        self._reported = tuple(name for name in _REPORT if name in needed)
+        self._wanted = np.array([_REPORT[name] for name in self._reported], np.int64)
+        self._codes_wanted = bool(needed & _CODES.keys())
+        self._masks = {f"_{name}": self._all for name in self._step_keys}
         self._over = np.zeros(0, np.int64)  # whose episodes ended with the last step
         self._seeds: list[int | None] = [None] * n
         self._is_reset = False
@@ -294,8 +310,14 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         state[kernel.S_LATE_LOW, which] = np.inf
         state[kernel.S_LATE_HIGH, which] = -np.inf
         integers[kernel.I_GEOMETRY, which] = geometries
-        for row in (kernel.I_STEPS, kernel.I_FIRST_STEP, kernel.I_SEEN, kernel.I_OVER):
+        for row in (kernel.I_STEPS, kernel.I_FIRST_STEP, kernel.I_SEEN, kernel.I_OVER, kernel.I_STATUS):
             integers[row, which] = 0
+        self._own[which] = (geometries != self._geometry) | (parameters != self._nominal_numbers).any(axis=0)
+        one_plant = not self._own.any()
+        if one_plant and not self._task_codes[kernel.T_ONE_PLANT]:
+            for work in self._works:
+                kernel.fill_plant(work, state[:, which[0]])
+        self._task_codes[kernel.T_ONE_PLANT] = one_plant
         if self.task.show_parameters:
             self._shown[which] = self._scaled_parameters(parameters).T
         if placed is None:
@@ -318,8 +340,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         if task.start == "random":
             state[kernel.S_X, which], state[kernel.S_V, which] = task.random_states(keys, episodes)
             return
-        geometries = self._integers[kernel.I_GEOMETRY, which]
-        own = (geometries != self._geometry) | (parameters != self._nominal_numbers).any(axis=0)
+        own = self._own[which]
         left = which
         if task.start == "cycle":
             phases = task.phases(keys, episodes)
@@ -330,7 +351,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             left = which[own][unknown == 1]
         for i in left.tolist():
             j = int(np.searchsorted(which, i))
-            single = self._as_parameters(parameters[:, j], geometries[j])
+            single = self._as_parameters(parameters[:, j], int(self._integers[kernel.I_GEOMETRY, i]))
             state[kernel.S_X, i], state[kernel.S_V, i] = task.start_state(single, int(keys[j]), int(episodes[j]))
 
     @functools.cached_property
@@ -435,24 +456,20 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         returns = self._state[kernel.S_RETURN].copy() if self.reward is not None else None
         with announced("step of a batch"):
             ended = self._advance(forces, out)
-        n = self.num_envs
-        report, codes = out.report[:, :n], out.codes[:, :n]
         terminated, truncated = out.over
-        info: dict[str, Any] = dict(self._masks)
-        info.update(zip(_REPORT, report, strict=True))
-        info["mode"], info["events"] = codes[kernel.C_MODE], codes[kernel.C_EVENTS]
-        info["status"] = self._all_ok
-        if ended and codes[kernel.C_STATUS].any():
-            info["status"] = _STATUS_NAMES[codes[kernel.C_STATUS]]
+        said = self._said(out, ended)
         if returns is not None:
-            self._replace_rewards(info, resting, out.rewards, returns)
+            self._replace_rewards(said, resting, out.rewards, returns)
         if self._views:
-            self._note_for_views(info, resting)
+            self._note_for_views(said, resting)
+        info: dict[str, Any] = dict(self._masks)
+        for name in self._step_keys:
+            info[name] = said[name]
         if len(resting):
             self._restart(resting)
             out.rewards[resting] = 0.0
             out.over[:, resting] = False
-            self._show_restarted(info, resting, None)
+            self._show_restarted(info, resting)
         if ended or len(resting):
             over = np.flatnonzero(terminated | truncated)
             if len(over):
@@ -461,13 +478,28 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
                     final = self._final(info, over)
                     del info["statistics"], info["_statistics"]
                     self._restart(over)
-                    self._show_restarted(info, over, final)
+                    self._show_restarted(info, over)
+                    info.update(final)
                     over = over[:0]
             self._over = over
         if self.render_mode == "human":
             self.render()
         observations = self._observations.copy() if self.copy else self._observations
         return observations, out.rewards, terminated, truncated, info
+
+    def _said(self, out: _Buffers, ended: int) -> dict[str, Any]:
+        """Return what was reported of the step, by name, each (num_envs,)."""
+        n = self.num_envs
+        said: dict[str, Any] = dict(zip(self._reported, out.report[:, :n], strict=True))
+        if self._codes_wanted:
+            for name, row in _CODES.items():
+                said[name] = out.codes[row, :n]
+        said["status"] = self._all_ok
+        if ended:
+            status = self._integers[kernel.I_STATUS, :n]
+            if status.any():
+                said["status"] = _STATUS_NAMES[status]
+        return said
 
     def _checked_actions(self, actions: Any) -> FloatArray:
         expected = f"actions must be finite numbers in an array of shape ({self.num_envs}, 1)"
@@ -490,8 +522,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         out = _Buffers(
             np.empty(n),
             np.empty((2, n), np.bool_),
-            np.empty((kernel.REPORT_ROWS, width)),
-            np.empty((kernel.CODE_ROWS, width), np.int64),
+            np.empty((len(self._wanted), width)),
+            np.empty((len(_CODES) if self._codes_wanted else 0, width), np.int64),
         )
         if not self.copy:
             self._kept = out
@@ -507,6 +539,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             self._past,
             self._shown,
             actions,
+            self._wanted,
             self._observations,
             *out,
         )
@@ -517,10 +550,10 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         return int(self._ended.sum())
 
     def _replace_rewards(
-        self, info: dict[str, Any], resting: IntegerArray, rewards: FloatArray, returns: FloatArray
+        self, said: Mapping[str, Any], resting: IntegerArray, rewards: FloatArray, returns: FloatArray
     ) -> None:
         assert self.reward is not None
-        columns = {name: info[name].tolist() for name in _STEP_KEYS}
+        columns = {name: said[name].tolist() for name in _STEP_KEYS}
         quiet = set(resting.tolist())
         for i in range(self.num_envs):
             if i not in quiet:
@@ -533,24 +566,26 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which]
         self._begin(which, *self._drawn(keys, episodes))
 
-    def _show_restarted(self, info: dict[str, Any], which: IntegerArray, final: dict[str, Any] | None) -> None:
-        """Let info say of environments that they have been reset (after what is ``final``, if they are that far)."""
-        stepped = ~self._mask(which)
-        for name in _ONLY_STEP_KEYS:
+    def _show_restarted(self, info: dict[str, Any], which: IntegerArray) -> None:
+        """Let info say of environments that they have been reset."""
+        mask = self._mask(which)
+        stepped = ~mask
+        for name in self._step_keys:
+            if name in _RESET_KEYS:
+                continue
             if not stepped.any():  # nobody has anything to say of a step
                 del info[name], info[f"_{name}"]
                 continue
-            values = info[name]
             if name == "status":
-                info[name] = values = values.copy()
-            values[which] = None if name == "status" else 0
+                info[name] = info[name].copy()
+            info[name][which] = None if name == "status" else 0
             info[f"_{name}"] = stepped
-        for name, start in self._at_start(which).items():
-            info[name][which] = start
-        mask = self._mask(which)
-        info["parameters"], info["_parameters"] = self._parameters_info(which, mask), mask
-        if final is not None:
-            info.update(final)
+        if not self.info_keys.isdisjoint(_RESET_KEYS):
+            for name, start in self._at_start(which).items():
+                if name in self.info_keys:
+                    info[name][which] = start
+        if "parameters" in self.info_keys:
+            info["parameters"], info["_parameters"] = self._parameters_info(which, mask), mask
 
     def _final(self, info: Mapping[str, Any], which: IntegerArray) -> dict[str, Any]:
         """Return the last observations and the info of environments that are about to be reset in the same step."""
@@ -559,7 +594,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         for i in which.tolist():
             observations[i] = self._observations[i].copy()
         last: dict[str, Any] = {"statistics": info["statistics"], "_statistics": mask}
-        for name in _STEP_KEYS:
+        for name in self._step_keys:
             last[f"_{name}"] = mask
             if name == "status":
                 last[name] = np.full(self.num_envs, None, object)
@@ -726,11 +761,11 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
 
     # Pictures ---------------------------------------------------------------------------------------------------------
 
-    def _note_for_views(self, info: Mapping[str, Any], resting: IntegerArray) -> None:
+    def _note_for_views(self, said: Mapping[str, Any], resting: IntegerArray) -> None:
         for i, view in self._views.items():
             if i not in resting:
-                seen = (float(info["x_min"][i]), float(info["x_max"][i]), float(info["stick_fraction"][i]))
-                view.note_for_picture(*seen, float(info["force"][i]))
+                seen = (float(said["x_min"][i]), float(said["x_max"][i]), float(said["stick_fraction"][i]))
+                view.note_for_picture(*seen, float(said["force"][i]))
 
     def render(self) -> tuple[Any, ...] | None:
         """Draw the environments ``render_envs``; a tuple of arrays (height, width, 3), uint8, in mode "rgb_array"."""
@@ -789,6 +824,16 @@ def _views(
     if render_mode is None:
         return {}
     return {i: single.twin() for i in chosen}
+
+
+def _checked_info_keys(info_keys: Any) -> frozenset[str]:
+    if isinstance(info_keys, str):
+        if info_keys == "all":
+            return frozenset(INFO_KEYS)
+        raise ValueError(f"info_keys must be 'all' or a sequence of names, got {info_keys!r}")
+    for name in info_keys:
+        checked_choice("info_keys", name, INFO_KEYS)
+    return frozenset(info_keys)
 
 
 def _whole(name: str, value: Any, low: int, high: int) -> int:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from sd_friction_env import ENVIRONMENT_IDS, OscillatorParameters, SDFrictionVectorEnv, kernel
+from sd_friction_env import ENVIRONMENT_IDS, SDFrictionVectorEnv
 
 MODES = [mode.value for mode in AutoresetMode]
 
@@ -27,7 +27,11 @@ def differences(ours, theirs, path=""):
             return [f"{path}: keys {set(ours) ^ set(theirs)}"]
         return [found for key in theirs for found in differences(ours[key], theirs[key], f"{path}/{key}")]
     if isinstance(theirs, tuple):
-        return [found for i, pair in enumerate(zip(ours, theirs, strict=True)) for found in differences(*pair, f"{path}/{i}")]
+        return [
+            found
+            for i, pair in enumerate(zip(ours, theirs, strict=True))
+            for found in differences(*pair, f"{path}/{i}")
+        ]
     ours, theirs = np.asarray(ours), np.asarray(theirs)
     if ours.dtype != theirs.dtype or ours.shape != theirs.shape:
         return [f"{path}: {ours.dtype}{ours.shape} {theirs.dtype}{theirs.shape}"]
@@ -61,6 +65,4 @@ def compare(ours, theirs, steps, seed=0, reset_seed=7, options=None):
 @pytest.mark.parametrize("env_id", ENVIRONMENT_IDS)
 def test_a_batch_returns_what_single_environments_return_in_every_mode_of_resetting(env_id, mode):
     kwargs = {"episode_steps": 37, "autoreset_mode": mode}
-    assert compare(batch(env_id, **kwargs), one_by_one(env_id, **kwargs), 160) >= 21
-
-
+    assert compare(batch(env_id, info_keys="all", **kwargs), one_by_one(env_id, **kwargs), 160) >= 21

@@ -6,7 +6,6 @@ import inspect
 import json
 import math
 import numbers
-import operator
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -28,14 +27,15 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack
 from torch import nn
 from tqdm import tqdm
 
 import sd_friction_env
 from agents import evaluation, runs
-from sd_friction_env import ENVIRONMENT_IDS, SDFrictionEnv, Table
+from sd_friction_env import ENVIRONMENT_IDS, Table
 from sd_friction_env.policies import NetworkPolicy
+from sd_friction_env.sb3 import SDFrictionVecEnv
 from sd_friction_env.wrappers import LARGEST_POWER, LARGEST_SCALE, SMALLEST_POWER, SMALLEST_SCALE, scaled_reward
 
 HYPERPARAMETERS = Path(__file__).parent / "hyperparameters"
@@ -49,7 +49,6 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"Tanh": nn.Tanh, "ReLU": nn.ReLU}
 
 LARGEST_SEED = 2**32 - 1
 _WRAPPER = "sd_friction_env.wrappers.ScaledReward"
-_FOLLOWED_ENVS = 16  # whose statistics go to TensorBoard: enough for a smooth curve, and cheap
 _KEPT_CHECKPOINTS = 2
 
 
@@ -451,37 +450,6 @@ def training_seed(seed: int, index: int = 0) -> int:
 # Environments ---------------------------------------------------------------------------------------------------------
 
 
-class _BareEnvs(DummyVecEnv):
-    """Environments side by side, without the deep copies that cost Stable-Baselines3 more than our step does."""
-
-    def reset(self) -> Any:
-        observations = super().reset()
-        for i, env in enumerate(self.envs):
-            bare = env.unwrapped
-            assert isinstance(bare, SDFrictionEnv)
-            steps = i * bare.task.episode_steps // self.num_envs
-            bare.set_state(dataclasses.replace(bare.get_state(), steps=steps))
-        return observations
-
-    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        n = self.num_envs
-        # Fresh arrays, for Stable-Baselines3 keeps those of the step before.
-        observations = np.empty((n, *self.observation_space.shape), np.float32)  # type: ignore[misc]
-        rewards = np.empty(n, np.float32)
-        dones = np.zeros(n, dtype=bool)
-        infos = []
-        for i, (env, action) in enumerate(zip(self.envs, self.actions, strict=True)):
-            observation, rewards[i], terminated, truncated, info = env.step(action)
-            info["TimeLimit.truncated"] = truncated and not terminated
-            if terminated or truncated:
-                dones[i] = True
-                info["terminal_observation"] = observation
-                observation, self.reset_infos[i] = env.reset()
-            observations[i] = observation
-            infos.append(info)
-        return observations, rewards, dones, infos
-
-
 class _ScaledRewards(VecEnvWrapper):
     def __init__(self, envs: VecEnv, scale: float, power: float) -> None:
         super().__init__(envs)
@@ -504,7 +472,7 @@ def make_training_envs(
     frame_stack: int = 1,
     scaling: tuple[float, float] = (1.0, 1.0),
 ) -> VecEnv:
-    """Return seeded environments to train on: monitored, rewards scaled, observations stacked.
+    """Return seeded environments to train on, a native batch: rewards scaled, observations stacked.
 
     Args:
         seed: of the run; environment i is reset with ``training_seed(seed, i)``.
@@ -514,11 +482,7 @@ def make_training_envs(
     moment ever after: every batch then holds squealing, settling and settled motion in their due shares.
     """
 
-    def make() -> gym.Env[Any, Any]:
-        env: gym.Env[Any, Any] = evaluation.make_env(env_id, env_kwargs)
-        return env
-
-    envs: VecEnv = VecMonitor(_BareEnvs([make] * n_envs))
+    envs: VecEnv = SDFrictionVecEnv(env_id, n_envs, stagger=True, **env_kwargs)
     if scaling != (1.0, 1.0):
         envs = _ScaledRewards(envs, *scaling)
     if frame_stack > 1:
@@ -618,54 +582,21 @@ class Result:
     evaluations: Table
 
 
-_STATISTICS = ("x_min", "x_max", "stick_fraction", "reward_vibration", "reward_effort", "reward_stick")
-_read_statistics = operator.itemgetter(*_STATISTICS, "reward_contact_loss")
-
-
-class _Statistics:
-    """Amplitude and stick over the last quarter of each training episode, and the reward's terms over all of it."""
-
-    def __init__(self, n_envs: int, episode_steps: int) -> None:
-        self.followed = min(n_envs, _FOLLOWED_ENVS)
-        self.late = episode_steps - max(1, episode_steps // 4)
-        self.steps = np.zeros(self.followed, dtype=int)
-        self.low = np.full(self.followed, np.inf)
-        self.high = np.full(self.followed, -np.inf)
-        self.stick = np.zeros(self.followed)
-        self.terms = np.zeros((self.followed, 4))
-
-    def add(self, infos: Sequence[Mapping[str, Any]], dones: NDArray[np.bool_], logger: Logger) -> None:
-        """Take note of one step of all environments, and of the episodes that end with it."""
-        values = np.array([_read_statistics(info) for info in infos[: self.followed]], dtype=float)
-        self.terms += values[:, 3:]
-        late = self.steps >= self.late
-        if late.any():
-            self.low[late] = np.minimum(self.low, values[:, 0])[late]
-            self.high[late] = np.maximum(self.high, values[:, 1])[late]
-            self.stick[late] += values[late, 2]
-        self.steps += 1
-        for i in np.flatnonzero(dones[: self.followed]):
-            if self.steps[i] > self.late:
-                logger.record_mean("episode/late_amplitude", 0.5 * float(self.high[i] - self.low[i]))
-                logger.record_mean("episode/late_stick_fraction", float(self.stick[i] / (self.steps[i] - self.late)))
-            for name, value in zip(("vibration", "effort", "stick", "contact_loss"), self.terms[i], strict=True):
-                logger.record_mean(f"episode/reward_{name}", float(value))
-            self.steps[i] = 0
-            self.low[i], self.high[i] = np.inf, -np.inf
-            self.stick[i] = 0.0
-            self.terms[i] = 0.0
+def log_episodes(infos: Sequence[Mapping[str, Any]], dones: NDArray[np.bool_], logger: Logger) -> None:
+    """Log what the episodes that have just ended came to."""
+    for i in np.flatnonzero(dones).tolist():
+        for name, value in infos[i]["statistics"].items():
+            if name not in ("return", "length") and not math.isnan(value):  # SB3 logs these two itself
+                logger.record_mean(f"episode/{name}", value)
 
 
 class _Supervisor(BaseCallback):
     """Watches a run: statistics, evaluation, the best model, checkpoints, progress, and the wish to stop."""
 
-    def __init__(
-        self, plan: Plan, folder: Path, episode_steps: int, progress: bool, should_stop: Callable[[], bool]
-    ) -> None:
+    def __init__(self, plan: Plan, folder: Path, progress: bool, should_stop: Callable[[], bool]) -> None:
         super().__init__()
         self.plan = plan
         self.folder = folder
-        self.statistics = _Statistics(plan.hyperparameters["n_envs"], episode_steps)
         self.should_stop = should_stop
         self.stopped = False
         self.rows: list[dict[str, Any]] = []
@@ -690,7 +621,7 @@ class _Supervisor(BaseCallback):
         (self.folder / runs.CHECKPOINTS).mkdir(exist_ok=True)
 
     def _on_step(self) -> bool:
-        self.statistics.add(self.locals["infos"], self.locals["dones"], self.logger)
+        log_episodes(self.locals["infos"], self.locals["dones"], self.logger)
         self.bar.update(min(self.num_timesteps, self.plan.steps) - self.bar.n)
         self.stopped = self.should_stop()
         return not self.stopped
@@ -824,8 +755,7 @@ def train(
         partial = runs.begin(folder, config, force=force)
         logger = Logger(None, [TensorBoardOutputFormat(str(partial / runs.TENSORBOARD))])
         model.set_logger(logger)
-        episode_steps = evaluation.make_env(plan.env_id, plan.env_kwargs).task.episode_steps
-        supervisor = _Supervisor(plan, partial, episode_steps, progress, should_stop)
+        supervisor = _Supervisor(plan, partial, progress, should_stop)
         # Off-policy algorithms log per episode, and all environments end theirs together.
         log_interval = 1 if plan.algorithm == "ppo" else plan.hyperparameters["n_envs"]
         model.learn(plan.steps, callback=supervisor, log_interval=log_interval)

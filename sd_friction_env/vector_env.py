@@ -57,7 +57,7 @@ _REPORT = {
 }
 _CODES = {"mode": kernel.C_MODE, "events": kernel.C_EVENTS}
 _STEP_KEYS = (*_REPORT, *_CODES, "status")
-_RESET_KEYS = ("x", "v", "v_belt", "v_rel", "mode", "normal_force", "time")
+RESET_KEYS = ("x", "v", "v_belt", "v_rel", "mode", "normal_force", "time")
 INFO_KEYS = (*_STEP_KEYS, "parameters")
 _STATUS_NAMES = np.array([kernel.STATUS_NAMES[code] for code in sorted(kernel.STATUS_NAMES)], object)
 _NUMBERS = tuple(RANGES)  # the numeric fields of OscillatorParameters
@@ -100,7 +100,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
 
     Those of :class:`SDFrictionEnv`; each value may also be an array (num_envs,), one entry per environment, and
     ``parameters`` a mapping of names to numbers or to such arrays, or a sequence of ``num_envs`` mappings. They hold
-    for the episodes that this reset starts. ``reset_mask``, a boolean array (num_envs,), says which environments are
+    for the episodes that this reset starts. A sequence of ``num_envs`` mappings says it for each on its own.
+    ``reset_mask``, a boolean array (num_envs,), says which environments are
     reset; the others go on.
 
     ## Info
@@ -199,13 +200,13 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         for shared in (self._all, self._all_ok):
             shared.setflags(write=False)
         # What is reported: all that the info holds, a reward function reads or a picture shows.
-        self._step_keys = tuple(name for name in _STEP_KEYS if name in self.info_keys)
+        self.step_keys = tuple(name for name in _STEP_KEYS if name in self.info_keys)
         pictured = ("x_min", "x_max", "stick_fraction", "force") if render_mode is not None else ()
-        needed = set(_STEP_KEYS if reward is not None else (*self._step_keys, *pictured))
+        needed = set(_STEP_KEYS if reward is not None else (*self.step_keys, *pictured))
         self._reported = tuple(name for name in _REPORT if name in needed)
         self._wanted = np.array([_REPORT[name] for name in self._reported], np.int64)
         self._codes_wanted = bool(needed & _CODES.keys())
-        self._masks = {f"_{name}": self._all for name in self._step_keys}
+        self._masks = {f"_{name}": self._all for name in self.step_keys}
         self._over = np.zeros(0, np.int64)  # whose episodes ended with the last step
         self._seeds: list[int | None] = [None] * n
         self._is_reset = False
@@ -215,7 +216,10 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     # Starting ---------------------------------------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start episodes, in all environments or in those of ``options["reset_mask"]``; see the class.
 
@@ -463,7 +467,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         if self._views:
             self._note_for_views(said, resting)
         info: dict[str, Any] = dict(self._masks)
-        for name in self._step_keys:
+        for name in self.step_keys:
             info[name] = said[name]
         if len(resting):
             self._restart(resting)
@@ -570,8 +574,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         """Let info say of environments that they have been reset."""
         mask = self._mask(which)
         stepped = ~mask
-        for name in self._step_keys:
-            if name in _RESET_KEYS:
+        for name in self.step_keys:
+            if name in RESET_KEYS:
                 continue
             if not stepped.any():  # nobody has anything to say of a step
                 del info[name], info[f"_{name}"]
@@ -580,7 +584,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
                 info[name] = info[name].copy()
             info[name][which] = None if name == "status" else 0
             info[f"_{name}"] = stepped
-        if not self.info_keys.isdisjoint(_RESET_KEYS):
+        if not self.info_keys.isdisjoint(RESET_KEYS):
             for name, start in self._at_start(which).items():
                 if name in self.info_keys:
                     info[name][which] = start
@@ -594,7 +598,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         for i in which.tolist():
             observations[i] = self._observations[i].copy()
         last: dict[str, Any] = {"statistics": info["statistics"], "_statistics": mask}
-        for name in self._step_keys:
+        for name in self.step_keys:
             last[f"_{name}"] = mask
             if name == "status":
                 last[name] = np.full(self.num_envs, None, object)
@@ -721,22 +725,26 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         Raises:
             AttributeError: if an environment has nothing of that name.
         """
+        return tuple(self.call_at(range(self.num_envs), name, *args, **kwargs))
+
+    def call_at(self, indices: Iterable[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
+        """:meth:`call` for some of the environments."""
         if name in self._attributes:
-            return tuple(self._attributes[name])
+            return [self._attributes[name][i] for i in indices]
         single = self._single
-        if not self._is_reset:
-            result = getattr(single, name)
-            return tuple(result(*args, **kwargs) if callable(result) else result for _ in range(self.num_envs))
         results = []
-        for i in range(self.num_envs):
-            before = self._state_of(i)
-            single.set_state(before)
+        for i in indices:
+            before = None
+            if self._is_reset:
+                before = self._state_of(i)
+                single.set_state(before)
             result = getattr(single, name)
             results.append(result(*args, **kwargs) if callable(result) else result)
-            after = single.get_state()
-            if after != before:
-                self._set_state(i, after)
-        return tuple(results)
+            if before is not None:
+                after = single.get_state()
+                if after != before:
+                    self._set_state(i, after)
+        return results
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Return an attribute of every environment."""
@@ -753,11 +761,18 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         listed = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
         if len(listed) != self.num_envs:
             raise ValueError(f"values must be {self.num_envs}, one per environment, got {len(listed)}")
+        for i, value in enumerate(listed):
+            self.set_attr_at([i], name, value)
+
+    def set_attr_at(self, indices: Iterable[int], name: str, value: Any) -> None:
+        """Set an attribute of some of the environments (None for the others, if it is new) to one value."""
         if hasattr(self._single, name):
             raise AttributeError(
                 f"{name!r} cannot be set: parameters and tasks are given to the constructor or to reset(options=...)"
             )
-        self._attributes[name] = listed
+        values = self._attributes.setdefault(name, [None] * self.num_envs)
+        for i in indices:
+            values[i] = value
 
     # Pictures ---------------------------------------------------------------------------------------------------------
 
@@ -888,8 +903,12 @@ def _checked_batch_options(options: Any, num_envs: int) -> tuple[NDArray[np.bool
     """
     if options is None:
         return None, None
+    if isinstance(options, Sequence) and not isinstance(options, str):
+        if len(options) != num_envs:
+            raise ValueError(f"options must be a mapping or {num_envs} of them, got {len(options)}")
+        return None, [checked_options(single) for single in options]
     if not isinstance(options, Mapping):
-        raise TypeError(f"options must be a mapping or None, got {options!r}")
+        raise TypeError(f"options must be a mapping, {num_envs} of them or None, got {options!r}")
     given = dict(options)
     mask = given.pop("reset_mask", None)
     if mask is not None:

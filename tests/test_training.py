@@ -465,8 +465,9 @@ def test_rewards_are_scaled_by_one_law_in_both_forms():
     scale, power = training.reward_scaling(settings)
     envs = training.make_training_envs(FORCE, {}, 1, 0, scaling=(scale, power))
     envs.reset()
-    _, rewards, _, infos = envs.step(np.array([[0.5]], np.float32))
-    raw = sum(infos[0][f"reward_{term}"] for term in ("vibration", "effort", "stick", "contact_loss"))
+    _, rewards, _, _ = envs.step(np.array([[0.5]], np.float32))
+    terms = envs.unwrapped.batch_info
+    raw = sum(terms[f"reward_{term}"][0] for term in ("vibration", "effort", "stick", "contact_loss"))
     assert rewards[0] == pytest.approx(-scale * abs(raw) ** power, rel=1e-6)
     wrapped = ScaledReward(gym.make(FORCE), scale=scale, power=power)
     wrapped.reset(seed=training.training_seed(0))

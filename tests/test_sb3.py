@@ -1,0 +1,161 @@
+"""The batch as Stable-Baselines3 takes it, beside its own DummyVecEnv."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sd_friction_env import ENVIRONMENT_IDS
+
+sb3 = pytest.importorskip("stable_baselines3")
+
+from stable_baselines3.common.monitor import Monitor  # noqa: E402
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize  # noqa: E402
+
+from sd_friction_env.sb3 import SDFrictionVecEnv  # noqa: E402
+
+FORCE = "SDFriction/Force-v0"
+
+
+def dummy(env_id, num_envs, **kwargs):
+    return DummyVecEnv([lambda: Monitor(gym.make(env_id, **kwargs))] * num_envs)
+
+
+def same(ours, theirs):
+    if isinstance(theirs, dict):
+        return set(ours) == set(theirs) and all(same(ours[name], theirs[name]) for name in theirs if name != "t")
+    if isinstance(theirs, np.ndarray):
+        return ours.dtype == theirs.dtype and ours.shape == theirs.shape and ours.tobytes() == theirs.tobytes()
+    return type(ours) is type(theirs) and (ours == theirs or (ours != ours and theirs != theirs))
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENT_IDS)
+def test_it_returns_step_by_step_what_a_dummy_vec_env_returns(env_id):
+    ours, theirs = SDFrictionVecEnv(env_id, 5, info_keys="all", episode_steps=23), dummy(env_id, 5, episode_steps=23)
+    for envs in (ours, theirs):
+        envs.seed(11)
+    assert same(ours.reset(), theirs.reset())
+    assert all(map(same, ours.reset_infos, theirs.reset_infos))
+    rng = np.random.default_rng(0)
+    ended = 0
+    for _ in range(80):
+        actions = rng.uniform(-1.0, 1.0, (5, 1)).astype(np.float32)
+        mine, reference = ours.step(actions), theirs.step(actions)
+        assert all(map(same, mine[:3], reference[:3]))
+        assert all(map(same, mine[3], reference[3]))
+        assert all(map(same, ours.reset_infos, theirs.reset_infos))
+        ended += mine[2].sum()
+    assert ended >= 15
+
+
+def test_lost_contact_ends_an_episode_and_is_not_a_time_limit():
+    envs = SDFrictionVecEnv(FORCE, 2, parameters={"geometry": "cubic", "alpha": 0.2}, episode_steps=100)
+    envs.set_options([{"x": 0.1, "v": 3.0}, {}])
+    envs.reset()
+    for _ in range(100):
+        _, rewards, dones, infos = envs.step(np.zeros((2, 1), np.float32))
+        if dones.any():
+            break
+    assert dones.tolist() == [True, False]
+    assert infos[0]["TimeLimit.truncated"] is False
+    assert infos[0]["statistics"]["reward_contact_loss"] < -1000.0
+    assert infos[0]["episode"]["r"] < -1000.0
+    assert rewards[0] < -1000.0
+
+
+def test_the_observations_kept_from_one_step_are_not_overwritten_by_the_next():
+    envs = SDFrictionVecEnv(FORCE, 4)
+    first = envs.reset()
+    kept = first.copy()
+    second = envs.step(np.ones((4, 1), np.float32))[0]
+    kept_second = second.copy()
+    envs.step(np.ones((4, 1), np.float32))
+    assert np.array_equal(first, kept)
+    assert np.array_equal(second, kept_second)
+
+
+def test_ppo_learns_the_same_on_the_batch_as_on_single_environments():
+    weights = []
+    for envs in (SDFrictionVecEnv(FORCE, 4, episode_steps=30), dummy(FORCE, 4, episode_steps=30)):
+        model = sb3.PPO("MlpPolicy", envs, n_steps=64, batch_size=64, n_epochs=2, seed=3, device="cpu")
+        model.learn(600)
+        assert model.ep_info_buffer[-1]["l"] == 30
+        weights.append([part.numpy().copy() for part in model.policy.state_dict().values()])
+    assert all(np.array_equal(a, b) for a, b in zip(*weights, strict=True))
+
+
+def test_off_policy_learning_bootstraps_at_the_time_limit():
+    envs = SDFrictionVecEnv(FORCE, 3, episode_steps=10)
+    model = sb3.SAC("MlpPolicy", envs, learning_starts=60, train_freq=20, seed=0, device="cpu")
+    model.learn(90)
+    buffer = model.replay_buffer
+    assert buffer.dones[:30].sum() == buffer.timeouts[:30].sum() == 9
+    ends = np.flatnonzero(buffer.dones[:30, 0])
+    # what follows an episode's end in the buffer is its last observation, not the next episode's first
+    assert not any(np.array_equal(buffer.next_observations[k, 0], buffer.observations[k + 1, 0]) for k in ends[:-1])
+
+
+def test_wrappers_attributes_and_methods_reach_the_environments():
+    envs = SDFrictionVecEnv(FORCE, 3)
+    envs.seed(5)
+    envs.set_options([{"x": 0.1 * i, "v": 0.0} for i in range(3)])
+    envs.reset()
+    assert [info["x"] for info in envs.reset_infos] == [0.0, 0.1, 0.2]
+    assert [state.x for state in envs.env_method("get_state", indices=[2, 0])] == [0.2, 0.0]
+    assert envs.get_attr("nominal", 1)[0].alpha == 0.8
+    envs.set_attr("label", "left", indices=[0])
+    assert envs.get_attr("label") == ["left", None, None]
+    assert not envs.has_attr("nonsense")
+    assert envs.env_is_wrapped(Monitor) == [True] * 3
+    stacked = VecNormalize(VecFrameStack(SDFrictionVecEnv(FORCE, 3), 4))
+    assert stacked.reset().shape == (3, 8)
+    assert stacked.step(np.zeros((3, 1), np.float32))[0].shape == (3, 8)
+
+
+def test_states_are_taken_and_given_back():
+    envs = SDFrictionVecEnv("SDFriction/BeltSpeedSensed-v0", 3)
+    envs.seed(5)
+    envs.reset()
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, 3, 1)).astype(np.float32)
+    for action in actions[:5]:
+        envs.step(action)
+    states = envs.env_method("get_state")
+    first = [envs.step(action)[:2] for action in actions]
+    for i, state in enumerate(states):
+        envs.env_method("set_state", state, indices=i)
+    second = [envs.step(action)[:2] for action in actions]
+    assert all(same(a[0], b[0]) and same(a[1], b[1]) for a, b in zip(first, second, strict=True))
+
+
+def test_staggered_episodes_end_one_after_another():
+    envs = SDFrictionVecEnv(FORCE, 5, episode_steps=50, stagger=True)
+    envs.reset()
+    ends = []
+    for step in range(1, 101):
+        dones = envs.step(np.zeros((5, 1), np.float32))[2]
+        ends += [(step, i) for i in np.flatnonzero(dones).tolist()]
+    assert ends == [(10, 4), (20, 3), (30, 2), (40, 1), (50, 0), (60, 4), (70, 3), (80, 2), (90, 1), (100, 0)]
+
+
+def test_pictures_are_tiled():
+    pytest.importorskip("pygame")
+    envs = SDFrictionVecEnv(FORCE, 2, render_mode="rgb_array")
+    envs.reset()
+    frame = envs.render("rgb_array")
+    assert frame.ndim == 3
+    assert frame.std() > 1.0
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"env_id": "CartPole-v1"}, "env_id must name"),
+        ({"copy": False}, "copy is not free"),
+        ({"stagger": 1}, "stagger must be"),
+        ({"num_envs": 0}, r"num_envs must be .* in \[1, "),
+        ({"info_keys": ["nonsense"]}, "info_keys must be one of"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        SDFrictionVecEnv(**({"env_id": FORCE, "num_envs": 2} | arguments))

@@ -408,7 +408,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 late_stick += row[7]
                 late += 1
         values = (
-            total,
+            total if self.reward is not None else vibration + effort + stick + contact_loss,
             len(self._log),
             amplitude(low, high) if late else math.nan,
             late_stick / late if late else math.nan,

@@ -17,6 +17,7 @@ import math
 from typing import NamedTuple
 
 import numba
+import numba.extending
 import numpy as np
 
 compiled = numba.njit(cache=True, error_model="numpy", nogil=True)
@@ -462,6 +463,26 @@ def _closing_guess(gap, slope, gap_end, slope_end, h):
     return h * s
 
 
+@in_lanes
+def _last_stretch(gap, slope, curvature, h):
+    """Return whether a gap's zero is so near that a Taylor step there is exact to rounding, and the time to it."""
+    falling = slope < 0.0
+    first = -gap / (slope if falling else -1.0)
+    bend = first * curvature / (slope if falling else -1.0)
+    # What is left out is of the order of the bend's square and of the third power of the time.
+    near = falling & (abs(first) <= LAST_STRETCH * h) & (bend * bend * abs(first) <= 0.1 * TIME_ZERO)
+    return near, first - 0.5 * bend * first if near else first
+
+
+@in_lanes
+def _stretch(plant, side, x, v, a, contact, curvature, dt, int_v2, int_fv):
+    """Return x, the integral of v^2 and that of the contact force's power after a Taylor step of length dt in slip."""
+    contact_slope = side * curvature + 2.0 * plant.beta * a + spring_slopes(plant, x)[0] * v
+    int_v2 = int_v2 + dt * (v * (v + a * dt))
+    int_fv = int_fv + dt * (contact * v + 0.5 * dt * (contact * a + contact_slope * v))
+    return x + dt * (v + 0.5 * a * dt), int_v2, int_fv
+
+
 @compiled
 def _closing(plant, mode, x, v, v_belt, a_belt, u, h, t, side, level, rate, looked, look):
     """Find where in (0, h] the gap side (v - level - rate t) falls through zero: Newton in a bracket, from a guess t.
@@ -482,25 +503,17 @@ def _closing(plant, mode, x, v, v_belt, a_belt, u, h, t, side, level, rate, look
             low = t
         else:
             high = t
+        near, following = _last_stretch(gap, slope, curvature, h)
         dt = 0.5 * (low + high) - t
-        near = False
-        if slope < 0.0:
-            first = -gap / slope
-            bend = first * curvature / slope
-            # What is left out is of the order of the bend's square and of the third power of dt.
-            near = abs(first) <= LAST_STRETCH * h and bend * bend * abs(first) <= 0.1 * TIME_ZERO
-            following = first - 0.5 * bend * first if near else first
-            if low < t + following < high:
-                dt = following
-            elif near:
-                dt = min(max(t + following, low), high) - t
+        if slope < 0.0 and low < t + following < high:
+            dt = following
+        elif near:
+            dt = min(max(t + following, low), high) - t
         if near or high - low < TIME_ZERO:
             break
         t = t + dt
-    dv2 = dv2 + dt * (v_t * (v_t + a_t * dt))
-    f_slope = side * curvature + 2.0 * plant.beta * a_t + spring_slopes(plant, x_t)[0] * v_t
-    dfv = dfv + dt * (f_t * v_t + 0.5 * dt * (f_t * a_t + f_slope * v_t))
-    return t + dt, x_t + dt * (v_t + 0.5 * a_t * dt), a_t, dv2, dfv
+    x_t, dv2, dfv = _stretch(plant, side, x_t, v_t, a_t, f_t, curvature, dt, dv2, dfv)
+    return t + dt, x_t, a_t, dv2, dfv
 
 
 @compiled
@@ -1284,11 +1297,13 @@ _X_END, _V_END, _BELT_END, _MODE, _EVENTS, _STATUS = 13, 14, 15, 16, 17, 18
 _INT_V2, _STICK_TIME, _INT_FV, _X_MIN, _X_MAX, _NORMAL = 19, 20, 21, 22, 23, 24
 _DONE_FAST = 25  # 1 where the fast path gave the answer
 _A, _A_END, _ERROR = 26, 27, 28
-_WORK_ROWS = 29
+_WORK_ROWS = 41
 WORK_SIZE = 2 * _WORK_ROWS * STRIDE  # a block's, and one for those of its environments that must be brought together
 # Rows of the second one while the places of events are looked at.
 _L_TIME, _L_SIDE, _L_LEVEL, _L_RATE, _L_MODE, _L_LANE = 13, 14, 15, 16, 17, 18
 _LOOK = 19  # and the eight after it
+_L_LANDS, _L_A = 29, 30
+_F_DONE, _F_X_TURN, _F_X_END, _F_INT_V2, _F_STICK_TIME, _F_INT_FV, _F_X_MIN, _F_X_MAX, _F_NORMAL = range(31, 40)
 
 # Rows of the environments' state, floats ...
 (
@@ -1371,7 +1386,8 @@ _REPORTED = (
 ) = range(12)
 TASK_NUMBERS = 12
 T_ACTUATOR, T_EPISODE_STEPS, T_LATE_STEPS, T_FULL_STATE, T_SEES_BELT, T_SENSOR_DELAY, T_ONE_PLANT = 0, 1, 2, 3, 4, 5, 6
-TASK_CODES = 7
+T_TRAVEL = 7
+TASK_CODES = 8
 
 
 # The cache would take it for slip_step itself.
@@ -1446,21 +1462,28 @@ def _cone_side_holds(plant, side, x, belt, a_belt, u, interval):
 
 
 @in_lanes
+def _rides(geometry, plant, x, belt, a_belt, u, t):
+    """Whether a mass at x that moves with the belt is sure to stick for a time t, told in one piece; x after that time,
+    and the integrals of v^2 and of the contact force's power over it."""
+    belt_end = belt + a_belt * t
+    reach = 0.124 * (1.0 if geometry == LINEAR or plant.alpha > 1.0 else plant.alpha)
+    holds = (abs(belt) * t <= reach) & (abs(belt_end) * t <= reach) & (belt * belt_end >= 0.0)
+    holds = holds & _cone_side_holds(plant, -1, x, belt, a_belt, u, t)
+    holds = holds & _cone_side_holds(plant, 1, x, belt, a_belt, u, t)
+    dx, int_v2, int_fv = _ride(plant, x, belt, a_belt, u, t)
+    return holds, x + dx, int_v2, int_fv
+
+
+@in_lanes
 def _stick_lane(geometry, w, i, interval):
     """Let one lane ride with the belt over the whole interval; mark it done if it does so in one piece."""
     plant = _lane_plant(geometry, w, i)
     x = w[_X * STRIDE + i]
     belt = w[_BELT * STRIDE + i]
     a_belt = w[_A_BELT * STRIDE + i]
-    u = w[_U * STRIDE + i]
+    holds, x_end, int_v2, int_fv = _rides(geometry, plant, x, belt, a_belt, w[_U * STRIDE + i], interval)
     belt_end = belt + a_belt * interval
-    reach = 0.124 * (1.0 if geometry == LINEAR or plant.alpha > 1.0 else plant.alpha)
-    done = (abs(belt) * interval <= reach) & (abs(belt_end) * interval <= reach) & (belt * belt_end >= 0.0)
-    done = done & _cone_side_holds(plant, -1, x, belt, a_belt, u, interval)
-    done = done & _cone_side_holds(plant, 1, x, belt, a_belt, u, interval)
-    done = done & (spring(plant, x)[1] > 0.0)
-    dx, int_v2, int_fv = _ride(plant, x, belt, a_belt, u, interval)
-    x_end = x + dx
+    done = holds & (spring(plant, x)[1] > 0.0)
     w[_X_END * STRIDE + i] = x_end
     w[_BELT_END * STRIDE + i] = belt_end
     w[_INT_V2 * STRIDE + i] = int_v2
@@ -1472,8 +1495,8 @@ def _stick_lane(geometry, w, i, interval):
 
 
 @in_lanes
-def _look_lane(geometry, w, i):
-    """Look at the place where one lane's slip step is thought to land or to turn."""
+def _look_lane(geometry, w, i, interval):
+    """Look at the place where one lane's slip step is thought to land or to turn, and finish what is plain."""
     plant = _lane_plant(geometry, w, i)
     x = w[_X * STRIDE + i]
     v = w[_V * STRIDE + i]
@@ -1498,8 +1521,64 @@ def _look_lane(geometry, w, i):
         dv2,
         dfv,
     )
-    for j in range(9):
-        w[(_LOOK + j) * STRIDE + i] = look[j]
+    gap, slope, curvature, x_t, v_t, a_t, f_t, dv2, dfv = look
+    w[_LOOK * STRIDE + i] = gap
+    w[(_LOOK + 1) * STRIDE + i] = slope
+    w[(_LOOK + 2) * STRIDE + i] = curvature
+    w[(_LOOK + 3) * STRIDE + i] = x_t
+    w[(_LOOK + 4) * STRIDE + i] = v_t
+    w[(_LOOK + 5) * STRIDE + i] = a_t
+    w[(_LOOK + 6) * STRIDE + i] = f_t
+    w[(_LOOK + 7) * STRIDE + i] = dv2
+    w[(_LOOK + 8) * STRIDE + i] = dfv
+    # What is plain to see from there is finished here, by the arithmetic of _closing, slip_until_event and _advance.
+    near, dt = _last_stretch(gap, slope, curvature, interval)
+    event_time = t + dt
+    inside = (event_time > (t if gap > 0.0 else 0.0)) & (event_time < (interval if gap > 0.0 else t))
+    x_event, dv2, dfv = _stretch(plant, w[_L_SIDE * STRIDE + i], x_t, v_t, a_t, f_t, curvature, dt, dv2, dfv)
+    done = near & inside & (spring(plant, x)[1] > 0.0) & (spring(plant, x_event)[1] > 0.0)
+    # It turns, or it lands (without having turned) and sticks for the rest of the interval.
+    side = 1.0 if v > 0.0 else -1.0
+    belt_event = belt + a_belt * event_time
+    lands = w[_L_LANDS * STRIDE + i] == 1.0
+    straight = v * belt_event > 0.0
+    straight = straight & _stays_open(side * v, side * w[_L_A * STRIDE + i], side * belt_event, side * a_t, event_time)
+    rest = interval - event_time
+    holds, x_end, stick_v2, stick_fv = _rides(geometry, plant, x_event, belt_event, a_belt, u, rest)
+    w[_F_DONE * STRIDE + i] = 1.0 if done & ((straight & holds & (rest > 0.0)) | (not lands)) else 0.0
+    w[_F_X_TURN * STRIDE + i] = x_event
+    w[_F_X_END * STRIDE + i] = x_end
+    w[_F_INT_V2 * STRIDE + i] = dv2 + stick_v2
+    w[_F_STICK_TIME * STRIDE + i] = 0.0 + rest
+    w[_F_INT_FV * STRIDE + i] = 0.0 + dfv + stick_fv
+    low = x_event if x_event < x else x
+    high = x_event if x_event > x else x
+    w[_F_X_MIN * STRIDE + i] = x_end if x_end < low else low
+    w[_F_X_MAX * STRIDE + i] = x_end if x_end > high else high
+    w[_F_NORMAL * STRIDE + i] = spring(plant, x_end)[1]
+
+
+@in_lanes
+def _finished(w, i, sub, n):
+    """Whether lane n of the second work space finished lane i's step; if so, take what came out."""
+    if sub[_F_DONE * STRIDE + n] == 0.0:
+        return False
+    if sub[_L_LANDS * STRIDE + n] == 0.0:
+        x_turn = sub[_F_X_TURN * STRIDE + n]
+        w[_X_MIN * STRIDE + i] = min(w[_X_MIN * STRIDE + i], x_turn)
+        w[_X_MAX * STRIDE + i] = max(w[_X_MAX * STRIDE + i], x_turn)
+        return True
+    w[_X_END * STRIDE + i] = sub[_F_X_END * STRIDE + n]
+    w[_V_END * STRIDE + i] = w[_BELT_END * STRIDE + i]
+    w[_MODE * STRIDE + i] = STICK
+    w[_EVENTS * STRIDE + i] = 1.0
+    w[_INT_V2 * STRIDE + i] = sub[_F_INT_V2 * STRIDE + n]
+    w[_STICK_TIME * STRIDE + i] = sub[_F_STICK_TIME * STRIDE + n]
+    w[_INT_FV * STRIDE + i] = sub[_F_INT_FV * STRIDE + n]
+    w[_X_MIN * STRIDE + i] = sub[_F_X_MIN * STRIDE + n]
+    w[_X_MAX * STRIDE + i] = sub[_F_X_MAX * STRIDE + n]
+    w[_NORMAL * STRIDE + i] = sub[_F_NORMAL * STRIDE + n]
+    return True
 
 
 @compiled
@@ -1548,10 +1627,11 @@ def _wants_look(w, i, sub, n, interval, one_plant):
     allowed = TOLERANCE * interval * max(1.0, abs(x), abs(v), STIFF * abs(a))
     if not w[_ERROR * STRIDE + i] <= allowed or gap <= V_REL_ZERO:
         return False
-    if gap_end <= 0.0:
+    lands = gap_end <= 0.0
+    if lands:
         t = _closing_guess(gap, slope, gap_end, slope_end, interval)
         side, level, rate = mode, belt, a_belt
-    elif v * v_end < 0.0 and not _dips(gap, slope, gap_end, slope_end, interval):
+    elif v * v_end < 0.0 and gap_end > V_REL_ZERO and not _dips(gap, slope, gap_end, slope_end, interval):
         side, level, rate = 1 if v > 0.0 else -1, 0.0, 0.0
         t = _closing_guess(side * v, side * a, side * v_end, side * a_end, interval)
     else:
@@ -1563,6 +1643,8 @@ def _wants_look(w, i, sub, n, interval, one_plant):
     sub[_L_RATE * STRIDE + n] = rate
     sub[_L_MODE * STRIDE + n] = mode
     sub[_L_LANE * STRIDE + n] = i
+    sub[_L_LANDS * STRIDE + n] = 1.0 if lands else 0.0
+    sub[_L_A * STRIDE + n] = a
     return True
 
 
@@ -1742,13 +1824,17 @@ def _account(task, codes, state, integers, work, wanted, rewards, over, report, 
         place = state[S_VIBRATION + row, first : first + m]
         for i in range(m):
             place[i] += q[(_Q_VIBRATION + row) * STRIDE + i]
-    travel = state[S_TRAVEL, first : first + m]
-    for i in range(m):
-        travel[i] += q[_Q_WAY * STRIDE + i]
+    if codes[T_TRAVEL]:
+        travel = state[S_TRAVEL, first : first + m]
+        for i in range(m):
+            travel[i] += q[_Q_WAY * STRIDE + i]
     worst = state[S_WORST, first : first + m]
+    worse = 0
     for i in range(m):
-        cost = -q[_Q_REWARD * STRIDE + i]
-        worst[i] = cost if cost > worst[i] else worst[i]
+        worse += 1 if -q[_Q_REWARD * STRIDE + i] > worst[i] else 0
+    if worse > 0:  # seldom, and memory is slow
+        for i in range(m):
+            worst[i] = max(worst[i], -q[_Q_REWARD * STRIDE + i])
     steps = integers[I_STEPS, first : first + m]
     terminated = over[0, first : first + m]
     truncated = over[1, first : first + m]
@@ -1793,12 +1879,9 @@ def _account(task, codes, state, integers, work, wanted, rewards, over, report, 
                 q[_Q_CONTACT_LOSS * STRIDE + i] = loss
                 q[_Q_REWARD * STRIDE + i] += loss
                 state[S_CONTACT_LOSS, first + i] += loss
-    total = state[S_RETURN, first : first + m]
     reward = rewards[first : first + m]
     for i in range(m):
         reward[i] = q[_Q_REWARD * STRIDE + i]
-    for i in range(m):
-        total[i] += q[_Q_REWARD * STRIDE + i]
     for j in range(len(wanted)):
         source = _REPORTED[wanted[j]] * STRIDE
         place = report[j, first : first + m]
@@ -1841,6 +1924,26 @@ def _observe_block(task, codes, w, shown, observations, first, m):
     for i in range(m):
         for j in range(shown.shape[1]):
             block[size * i + place + j] = shown[first + i, j]
+
+
+if numba.config.DISABLE_JIT:
+
+    def _bare(array):
+        return array
+
+else:
+
+    @numba.extending.intrinsic
+    def _bare(context, array):
+        """Return the array without its count of references, which all threads would have to write to at every slice."""
+
+        def generate(context, builder, signature, arguments):
+            bare = context.make_array(array)(context, builder, arguments[0])
+            bare.meminfo = bare.meminfo.type(None)
+            bare.parent = bare.parent.type(None)
+            return bare._getvalue()
+
+        return array(array), generate
 
 
 @compiled
@@ -1886,9 +1989,9 @@ def _stepper(geometry):
     It takes
 
         work: (WORK_SIZE,), this call's own. start, end: which environments to step.
-        task (12,), codes (7,): what holds for the whole batch. state (21, n), integers (8, n): of each environment;
+        task (12,), codes (8,): what holds for the whole batch. state (21, n), integers (8, n): of each environment;
             rows as named above. past, shown: see :func:`observe`. With T_ONE_PLANT the plant and its belt speed stand
-            in both halves of ``work`` already.
+            in both halves of ``work`` already; the belt's way is only kept with T_TRAVEL.
         actions: (n,), finite; outside [-1, 1] they are clipped.
         wanted: (k,), which rows of the report are.
         observations (n, size), rewards (n,), over (2, n) (terminated, truncated), report (k, n) and report_codes
@@ -1916,6 +2019,10 @@ def _stepper(geometry):
         report,
         report_codes,
     ):
+        task, codes, work = _bare(task), _bare(codes), _bare(work)
+        state, integers, past, shown = _bare(state), _bare(integers), _bare(past), _bare(shown)
+        actions, wanted, observations, rewards = _bare(actions), _bare(wanted), _bare(observations), _bare(rewards)
+        over, report, report_codes = _bare(over), _bare(report), _bare(report_codes)
         interval = task[T_INTERVAL]
         w = work[: _WORK_ROWS * STRIDE]
         sub = work[_WORK_ROWS * STRIDE :]
@@ -1953,7 +2060,7 @@ def _stepper(geometry):
             failures = 0
             n = 0
             for i in range(m):
-                if geometries[i] != geometry:
+                if not one_plant and geometries[i] != geometry:
                     failures += _lane_by_events(geometries[i], w, i, interval, NOTHING_KNOWN)
                 elif w[_DONE_FAST * STRIDE + i] == 0.0:
                     if not fast or w[_V * STRIDE + i] == w[_BELT * STRIDE + i]:
@@ -1965,9 +2072,11 @@ def _stepper(geometry):
             if n > 0:
                 # Events in the midst of a slip step are looked at side by side as well.
                 for i in range(_whole(n)):
-                    _look_lane(geometry, sub, i)
+                    _look_lane(geometry, sub, i, interval)
                 for j in range(n):
-                    failures += _lane_after_trial(geometry, w, int(sub[_L_LANE * STRIDE + j]), sub, j, interval, 2.0)
+                    i = int(sub[_L_LANE * STRIDE + j])
+                    if not _finished(w, i, sub, j):
+                        failures += _lane_after_trial(geometry, w, i, sub, j, interval, 2.0)
             ended += _account(
                 task, codes, state, integers, work, wanted, rewards, over, report, report_codes, first, m, failures
             )

@@ -184,7 +184,10 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self._shown = np.zeros((n, len(task.randomise) if task.show_parameters else 0))
         shares = max(1, min(self.threads, n // _ENVS_WORTH_A_THREAD))
         self._works = np.ones((shares, kernel.WORK_SIZE))
+        self._task_codes[kernel.T_TRAVEL] = render_mode is not None
         self._own = np.zeros(n, np.bool_)  # who has other parameters than the nominal ones
+        self._stepper = (kernel.STEPPERS if shares == 1 else kernel.STEPPERS_IN_THREADS)[self._geometry]
+        self._is_warm = False
         # Every share but the last is made of whole blocks.
         blocks = -(-n // kernel.LANES)
         self._bounds = np.minimum(kernel.LANES * (np.arange(shares + 1) * blocks // shares), n)
@@ -193,6 +196,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         assert shape is not None
         self._observations = np.zeros((n, *shape), np.float32)
         self._kept: _Buffers | None = None
+        self._no_codes = np.empty((0, self._width), np.int64)
         self._everyone = np.arange(n)
         # What holds for all is one array for all steps, and cannot be written to.
         self._all = np.ones(n, np.bool_)
@@ -206,6 +210,9 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self._reported = tuple(name for name in _REPORT if name in needed)
         self._wanted = np.array([_REPORT[name] for name in self._reported], np.int64)
         self._codes_wanted = bool(needed & _CODES.keys())
+        self._status_wanted = "status" in needed
+        told = {*self._reported, *(_CODES if self._codes_wanted else ()), *(needed & {"status"})}
+        self._unasked = tuple(told - set(self.step_keys))
         self._masks = {f"_{name}": self._all for name in self.step_keys}
         self._over = np.zeros(0, np.int64)  # whose episodes ended with the last step
         self._seeds: list[int | None] = [None] * n
@@ -457,18 +464,16 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
                 "options={'reset_mask': ...} before step()"
             )
         out = self._buffers()
-        returns = self._state[kernel.S_RETURN].copy() if self.reward is not None else None
-        with announced("step of a batch"):
-            ended = self._advance(forces, out)
+        ended = self._advance(forces, out)
         terminated, truncated = out.over
         said = self._said(out, ended)
-        if returns is not None:
-            self._replace_rewards(said, resting, out.rewards, returns)
+        if self.reward is not None:
+            self._replace_rewards(said, resting, out.rewards)
         if self._views:
             self._note_for_views(said, resting)
-        info: dict[str, Any] = dict(self._masks)
-        for name in self.step_keys:
-            info[name] = said[name]
+        info = {**self._masks, **said}
+        for name in self._unasked:
+            del info[name]
         if len(resting):
             self._restart(resting)
             out.rewards[resting] = 0.0
@@ -498,8 +503,9 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         if self._codes_wanted:
             for name, row in _CODES.items():
                 said[name] = out.codes[row, :n]
-        said["status"] = self._all_ok
-        if ended:
+        if self._status_wanted:
+            said["status"] = self._all_ok
+        if ended and self._status_wanted:
             status = self._integers[kernel.I_STATUS, :n]
             if status.any():
                 said["status"] = _STATUS_NAMES[status]
@@ -527,7 +533,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             np.empty(n),
             np.empty((2, n), np.bool_),
             np.empty((len(self._wanted), width)),
-            np.empty((len(_CODES) if self._codes_wanted else 0, width), np.int64),
+            np.empty((len(_CODES), width), np.int64) if self._codes_wanted else self._no_codes,
         )
         if not self.copy:
             self._kept = out
@@ -547,22 +553,24 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             self._observations,
             *out,
         )
-        shares = len(self._works)
-        if shares == 1:
-            return int(kernel.STEPPERS[self._geometry](self._works[0], 0, self.num_envs, *arguments))
-        kernel.STEPPERS_IN_THREADS[self._geometry](self._works, self._bounds, self._ended, *arguments)
+        if not self._is_warm:
+            with announced("step of a batch"):
+                self._is_warm = True
+                return self._advance(actions, out)
+        if len(self._works) == 1:
+            ended: int = self._stepper(self._works[0], 0, self.num_envs, *arguments)
+            return ended
+        self._stepper(self._works, self._bounds, self._ended, *arguments)
         return int(self._ended.sum())
 
-    def _replace_rewards(
-        self, said: Mapping[str, Any], resting: IntegerArray, rewards: FloatArray, returns: FloatArray
-    ) -> None:
+    def _replace_rewards(self, said: Mapping[str, Any], resting: IntegerArray, rewards: FloatArray) -> None:
         assert self.reward is not None
         columns = {name: said[name].tolist() for name in _STEP_KEYS}
         quiet = set(resting.tolist())
         for i in range(self.num_envs):
             if i not in quiet:
                 rewards[i] = float(self.reward({name: values[i] for name, values in columns.items()}))
-        self._state[kernel.S_RETURN, : self.num_envs] = returns[: self.num_envs] + rewards
+        self._state[kernel.S_RETURN, : self.num_envs] += rewards
 
     def _restart(self, which: IntegerArray) -> None:
         """Start the next episodes of environments."""
@@ -612,16 +620,14 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         state = self._state[:, which]
         steps = self._integers[kernel.I_STEPS, which] - self._integers[kernel.I_FIRST_STEP, which]
         late = np.where(state[kernel.S_LATE_TIME] > 0.0, state[kernel.S_LATE_TIME], np.nan)
+        terms = state[[kernel.S_VIBRATION, kernel.S_EFFORT, kernel.S_STICK, kernel.S_CONTACT_LOSS]]
         with np.errstate(invalid="ignore"):
             values = (
-                state[kernel.S_RETURN],
+                ((terms[0] + terms[1]) + terms[2]) + terms[3] if self.reward is None else state[kernel.S_RETURN],
                 steps,
                 amplitude(state[kernel.S_LATE_LOW], state[kernel.S_LATE_HIGH]) + 0.0 * late,
                 state[kernel.S_LATE_STICK] / late,
-                state[kernel.S_VIBRATION],
-                state[kernel.S_EFFORT],
-                state[kernel.S_STICK],
-                state[kernel.S_CONTACT_LOSS],
+                *terms,
             )
         mask = self._mask(which)
         statistics: dict[str, Any] = {}

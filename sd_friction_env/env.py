@@ -32,6 +32,16 @@ EPISODE_STATISTICS = (
     "reward_stick",
     "reward_contact_loss",
 )
+# What a step's info always holds, in its order.
+_STEP_INFO: dict[str, Any] = {
+    **dict.fromkeys(("x", "v", "v_belt", "v_rel"), 0.0),
+    "mode": 0,
+    **dict.fromkeys(("normal_force", "time", "action", "force", "belt_acceleration", "x_min", "x_max"), 0.0),
+    **dict.fromkeys(("mean_square_velocity", "stick_fraction", "friction_power", "control_power"), 0.0),
+    "events": 0,
+    "status": kernel.STATUS_NAMES[kernel.OK],
+    **dict.fromkeys(("reward_vibration", "reward_effort", "reward_stick", "reward_contact_loss"), 0.0),
+}
 READOUT_INTERVALS = 100  # the window of the rendered amplitude and stick readouts
 
 
@@ -240,9 +250,19 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         assert task.x_offset is not None
         assert task.x_scale is not None
         assert task.v_scale is not None
-        self._x_offset, self._x_scale, self._v_scale = task.x_offset, task.x_scale, task.v_scale
-        self._belt_speed = parameters.belt_speed
-        self._belt_authority = task.belt_authority or 1.0
+        # All that an observation needs, likewise in one piece.
+        self._optics = (
+            self._observation_shape,
+            self._limit,
+            self._plain_sensor,
+            self._full_state,
+            self._sees_belt,
+            task.x_offset,
+            task.x_scale,
+            task.v_scale,
+            parameters.belt_speed,
+            task.belt_authority or 1.0,
+        )
         self._interval = task.control_interval
         self._last_step = task.episode_steps
         self._shown: tuple[float, ...] = ()
@@ -288,7 +308,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.clear_picture()
         if self.render_mode == "human":
             self.render()
-        return self._observation(), {
+        return self._observation(x, v, self._v_belt), {
             "x": x,
             "v": v,
             "v_belt": self._v_belt,
@@ -311,11 +331,12 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._steps < 0 or self._ended:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         try:
-            a = action.item() if action.shape == (1,) else math.nan
-            if not -1.0 <= a <= 1.0:
+            (a,) = action.tolist()
+            if type(a) is not float or not -1.0 <= a <= 1.0:
                 a = _clipped_action(action)
-        except (AttributeError, TypeError):
+        except (AttributeError, TypeError, ValueError):
             a = _clipped_action(action)
+        v_belt_before = self._v_belt
         (
             x,
             v,
@@ -335,52 +356,52 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             x_min,
             x_max,
             normal_force,
-        ) = kernel.control_interval(*self._constants, self._x, self._v, self._v_belt, a)
-        self._belt_travel += 0.5 * (self._v_belt + v_belt) * self._interval
+        ) = kernel.control_interval(*self._constants, self._x, self._v, v_belt_before, a)
+        interval = self._interval
+        self._belt_travel += 0.5 * (v_belt_before + v_belt) * interval
         self._x = x
         self._v = v
         self._v_belt = v_belt
         self._mode = mode
-        self._force = force
-        self._steps += 1
+        self._steps = steps = self._steps + 1
         reward = vibration + effort + stick
         if -reward > self._worst_cost:
             self._worst_cost = -reward
         terminated = False
-        truncated = self._steps >= self._last_step
+        truncated = steps >= self._last_step
+        # A copy of what has all the names is much faster than a new dictionary.
+        info = _STEP_INFO.copy()
+        info["x"] = x
+        info["v"] = v
+        info["v_belt"] = v_belt
+        info["v_rel"] = v - v_belt
+        info["mode"] = mode
+        info["normal_force"] = normal_force
+        info["time"] = steps * interval
+        info["action"] = a
+        info["force"] = force
+        info["belt_acceleration"] = a_belt
+        info["x_min"] = x_min
+        info["x_max"] = x_max
+        info["mean_square_velocity"] = mean_v2
+        info["stick_fraction"] = stick_fraction
+        info["friction_power"] = friction_power
+        info["control_power"] = control_power
+        info["events"] = events
+        info["reward_vibration"] = vibration
+        info["reward_effort"] = effort
+        info["reward_stick"] = stick
         contact_loss = 0.0
         if status != kernel.OK:
             self._ended = True
+            info["status"] = kernel.STATUS_NAMES[status]
             terminated = status == kernel.CONTACT_LOST
             truncated = truncated or not terminated
             if terminated:
-                steps_left = max(0, self._last_step - self._steps) + 1
+                steps_left = max(0, self._last_step - steps) + 1
                 contact_loss = -steps_left * max(self.task.contact_loss_cost, self._worst_cost)
+                info["reward_contact_loss"] = contact_loss
                 reward += contact_loss
-        info = {
-            "x": x,
-            "v": v,
-            "v_belt": v_belt,
-            "v_rel": v - v_belt,
-            "mode": mode,
-            "normal_force": normal_force,
-            "time": self._steps * self._interval,
-            "action": a,
-            "force": force,
-            "belt_acceleration": a_belt,
-            "x_min": x_min,
-            "x_max": x_max,
-            "mean_square_velocity": mean_v2,
-            "stick_fraction": stick_fraction,
-            "friction_power": friction_power,
-            "control_power": control_power,
-            "events": events,
-            "status": kernel.STATUS_NAMES[status],
-            "reward_vibration": vibration,
-            "reward_effort": effort,
-            "reward_stick": stick,
-            "reward_contact_loss": contact_loss,
-        }
         if self.reward is not None:
             reward = float(self.reward(info))
         if self.render_mode is not None:
@@ -390,7 +411,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._log.append((reward, vibration, effort, stick, contact_loss, x_min, x_max, stick_fraction))
         if terminated or truncated:
             info["statistics"] = self._statistics()
-        return self._observation(), reward, terminated, truncated, info
+        return self._observation(x, v, v_belt), reward, terminated, truncated, info
 
     def _statistics(self) -> dict[str, Any]:
         """Return what the episode came to; "late" is the last quarter of its time."""
@@ -419,30 +440,28 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         )
         return dict(zip(EPISODE_STATISTICS, values, strict=True))
 
-    def _observation(self) -> NDArray[np.float32]:
-        x, v = self._x, self._v
-        if not self._plain_sensor:
-            x, v = self._sensed()
-        limit = self._limit
-        observation = np.empty(self._observation_shape, np.float32)
-        value = (x - self._x_offset) / self._x_scale
+    def _observation(self, x: float, v: float, v_belt: float) -> NDArray[np.float32]:
+        shape, limit, plain, full_state, sees_belt, x_offset, x_scale, v_scale, belt_speed, authority = self._optics
+        if not plain:
+            x, v = self._sensed(x, v)
+        observation = np.empty(shape, np.float32)
+        value = (x - x_offset) / x_scale
         observation[0] = value if -limit <= value <= limit else math.copysign(limit, value)
         place = 1
-        if self._full_state:
-            value = v / self._v_scale
+        if full_state:
+            value = v / v_scale
             observation[1] = value if -limit <= value <= limit else math.copysign(limit, value)
             place = 2
-            if self._sees_belt:
-                value = (self._v_belt / self._belt_speed - 1.0) / self._belt_authority
+            if sees_belt:
+                value = (v_belt / belt_speed - 1.0) / authority
                 observation[2] = value if -limit <= value <= limit else math.copysign(limit, value)
                 place = 3
         if self._shown:
             observation[place:] = self._shown
         return observation
 
-    def _sensed(self) -> tuple[float, float]:
+    def _sensed(self, x: float, v: float) -> tuple[float, float]:
         """Return x and v as the sensor gives them: some intervals old, with the noise of the interval they are from."""
-        x, v = self._x, self._v
         if self.task.sensor_noise > 0.0:
             assert self._key is not None
             x += self.task.sensor_noise * kernel.random_normal(self._key, self._episode, self._steps + 1, 0)

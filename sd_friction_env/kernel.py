@@ -1265,7 +1265,7 @@ def random_uniforms(keys, episodes, step, slot):
     """Return :func:`random_uniform` for arrays of keys and episodes, both (n,)."""
     numbers = np.empty(len(keys))
     for i in range(len(keys)):
-        numbers[i] = random_uniform(keys[i], episodes[i], step, slot)
+        numbers[i] = random_uniform(int(keys[i]), int(episodes[i]), step, slot)
     return numbers
 
 
@@ -1926,7 +1926,7 @@ def _observe_block(task, codes, w, shown, observations, first, m):
             block[size * i + place + j] = shown[first + i, j]
 
 
-if numba.config.DISABLE_JIT:
+if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
 
     def _bare(array):
         return array

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 import sd_friction_env
 from sd_friction_env import kernel
-from sd_friction_env.env import SDFrictionEnv
+from sd_friction_env.env import ACTUATOR_CODES, SDFrictionEnv
 from sd_friction_env.task import passive_motion
 
 Array = NDArray[np.float64]
@@ -122,7 +122,22 @@ def make_problem(env_id: str, seeds: Sequence[int]) -> Problem:
         _, info = env.reset(seed=int(seed))
         starts[i] = info["x"], info["v"], info["v_belt"]
     belt_moves = env.task.actuator == "belt_speed"
-    return Problem(env_id, env._constants, belt_moves, env.task.episode_steps, starts)
+    return Problem(env_id, _constants(env), belt_moves, env.task.episode_steps, starts)
+
+
+def _constants(env: SDFrictionEnv) -> tuple[float, ...]:
+    """Return what ``kernel.control_interval`` needs of an environment, in its order."""
+    task = env.task
+    return (
+        *env.parameters.plant,
+        ACTUATOR_CODES[task.actuator],
+        task.authority,
+        task.belt_acceleration_limit,
+        env.parameters.belt_speed,
+        task.control_interval,
+        task.w_effort,
+        task.w_stick,
+    )
 
 
 def _make(env_id: str) -> SDFrictionEnv:

@@ -2,7 +2,6 @@
 
 import collections
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from typing import Any, Self, SupportsFloat
 
@@ -16,7 +15,7 @@ from sd_friction_env.orbits import stick_intervals
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_choice, checked_number
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.startup import announced
-from sd_friction_env.task import Task, rig_arguments
+from sd_friction_env.task import FloatArray, IntegerArray, Task, rig_arguments
 
 RewardFunction = Callable[[Mapping[str, Any]], float]
 
@@ -167,26 +166,24 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.reward = reward
         with announced("orbits"):
             self.task = task.with_scales(self.nominal)
-        self._full_state = task.sensor == "state"
-        self._plain_sensor = self._full_state and task.sensor_noise == 0.0 and task.sensor_delay == 0
-        self._sees_belt = self._full_state and task.actuator == "belt_speed"
-        size = 1 + self._full_state + self._sees_belt + (len(task.randomise) if task.show_parameters else 0)
-        self._limit = self.task.observation_limit
-        self._observation_shape = (size,)
-        self.observation_space = spaces.Box(-self._limit, self._limit, self._observation_shape, np.float32)
+        sees = (task.sensor == "state") + (task.sensor == "state" and task.actuator == "belt_speed")
+        shows = len(task.randomise) if task.show_parameters else 0
+        limit = self.task.observation_limit
+        self.observation_space = spaces.Box(-limit, limit, (1 + sees + shows,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         self._renderer: Any = None
         self._key: int | None = None
-        self._episode = 0
-        self._steps = -1  # not reset yet
-        self._ended = False
-        self._worst_cost = 0.0
-        self._past: collections.deque[tuple[float, float]] = collections.deque(maxlen=task.sensor_delay + 1)
+        self._running = False
         self._window: collections.deque[tuple[float, float, float]] = collections.deque(maxlen=READOUT_INTERVALS)
-        self._log: list[tuple[float, ...]] = []
-        self._x = self._v = self._v_belt = self._belt_travel = 0.0
         self._mode = kernel.STICK
         self._force = 0.0
+        numbers, codes = task_arrays(self.task)
+        past = 2 * (task.sensor_delay + 1) if task.sensor_delay else 0
+        self._memory = np.zeros(len(numbers) + len(codes) + kernel.INTEGER_ROWS + kernel.STATE_ROWS + past + shows)
+        self._memory[: len(numbers)] = numbers
+        self._memory[len(numbers) : len(numbers) + len(codes)].view(np.int64)[:] = codes
+        self._observations = np.zeros((1, 1 + sees + shows), np.float32)
+        self._look_into_memory()
         self._use(self.nominal)
 
     @classmethod
@@ -228,51 +225,42 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         )
         return cls(parameters, **rig, **arguments)
 
+    def _look_into_memory(self) -> None:
+        with announced("one environment"):
+            arrays = kernel.arrays_in(self._memory)
+        self._numbers, self._codes, self._state, self._integers, self._past, self._shown = arrays
+        self._seen = self._observations[0]
+
+    def __getstate__(self) -> dict[str, Any]:
+        views = ("_numbers", "_codes", "_state", "_integers", "_past", "_shown", "_seen")
+        return {name: value for name, value in vars(self).items() if name not in views}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._look_into_memory()  # a copied view would look into no one's memory
+
     @property
     def parameters(self) -> OscillatorParameters:
         """The parameters of the present episode."""
         return self._parameters
 
     def _use(self, parameters: OscillatorParameters) -> None:
-        task = self.task
+        """Begin anew with these parameters, the belt at its nominal speed."""
         self._parameters = parameters
-        # All that compiled code needs of plant and task, in its order of arguments: floats pass its border cheaply.
-        self._constants = (
-            *parameters.plant,
-            ACTUATOR_CODES[task.actuator],
-            task.authority,
-            task.belt_acceleration_limit,
-            parameters.belt_speed,
-            task.control_interval,
-            task.w_effort,
-            task.w_stick,
-        )
-        assert task.x_offset is not None
-        assert task.x_scale is not None
-        assert task.v_scale is not None
-        # All that an observation needs, likewise in one piece.
-        self._optics = (
-            self._observation_shape,
-            self._limit,
-            self._plain_sensor,
-            self._full_state,
-            self._sees_belt,
-            task.x_offset,
-            task.x_scale,
-            task.v_scale,
-            parameters.belt_speed,
-            task.belt_authority or 1.0,
-        )
-        self._interval = task.control_interval
-        self._last_step = task.episode_steps
-        self._shown: tuple[float, ...] = ()
-        if task.show_parameters:
-            self._shown = tuple(
-                min(max(2.0 * (getattr(parameters, name) - low) / (high - low) - 1.0, -self._limit), self._limit)
-                if high > low
-                else 0.0
-                for name, (low, high) in task.randomise.items()
-            )
+        geometry, *numbers = parameters.plant
+        state, integers = self._state[:, 0], self._integers[:, 0]
+        blank_episode(self._state, self._integers, slice(None))
+        integers[kernel.I_GEOMETRY] = geometry
+        state[: kernel.S_BELT_SPEED] = numbers
+        state[kernel.S_BELT_SPEED] = state[kernel.S_BELT] = parameters.belt_speed
+        if self.task.show_parameters:
+            self._shown[0] = self.task.shown_parameters(dataclasses.asdict(parameters))
+
+    def _observe(self) -> NDArray[np.float32]:
+        arrays = (self._numbers, self._codes, self._state, self._integers, self._past, self._shown)
+        kernel.observe(*arrays, self._observations, (0,))
+        seen: NDArray[np.float32] = self._seen.copy()
+        return seen
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -283,7 +271,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             TypeError, ValueError: if an option is unknown or out of its range; the running episode is then untouched.
         """
         options = checked_options(options)
-        key, episode = self._key, self._episode + 1
+        key, episode = self._key, int(self._integers[kernel.I_EPISODE, 0]) + 1
         if seed is not None or key is None:
             super().reset(seed=seed)
             key, episode = int(self.np_random.integers(2**62)), 0
@@ -294,25 +282,21 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             check_belt(parameters)
         with announced("starts"):
             x, v = start_of(task, parameters, options, key, episode)
-        self._key, self._episode = key, episode
+        self._key = key
         self._use(parameters)
-        self._x, self._v, self._v_belt = x, v, parameters.belt_speed
-        self._belt_travel = 0.0
-        self._steps = 0
-        self._ended = False
-        self._worst_cost = 0.0
-        self._mode = kernel.mode_of(parameters.plant, x, v, parameters.belt_speed, 0.0, 0.0)
-        self._force = 0.0
-        self._past.clear()
-        self._log.clear()
+        self._integers[kernel.I_KEY], self._integers[kernel.I_EPISODE] = key, episode
+        self._state[kernel.S_X], self._state[kernel.S_V] = x, v
+        self._running = True
+        v_belt = parameters.belt_speed
+        self._mode = kernel.mode_of(parameters.plant, x, v, v_belt, 0.0, 0.0)
         self.clear_picture()
         if self.render_mode == "human":
             self.render()
-        return self._observation(x, v, self._v_belt), {
+        return self._observe(), {
             "x": x,
             "v": v,
-            "v_belt": self._v_belt,
-            "v_rel": v - self._v_belt,
+            "v_belt": v_belt,
+            "v_rel": v - v_belt,
             "mode": self._mode,
             "normal_force": kernel.spring(parameters.plant, x)[1],
             "time": 0.0,
@@ -328,7 +312,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             TypeError, ValueError: if the action is not one finite number in an array of shape (1,).
             gymnasium.error.ResetNeeded: before the first reset, and after contact was lost.
         """
-        if self._steps < 0 or self._ended:
+        if not self._running:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         try:
             (a,) = action.tolist()
@@ -336,139 +320,50 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 a = _clipped_action(action)
         except (AttributeError, TypeError, ValueError):
             a = _clipped_action(action)
-        v_belt_before = self._v_belt
-        (
-            x,
-            v,
-            v_belt,
-            mode,
-            status,
-            events,
-            force,
-            a_belt,
-            vibration,
-            effort,
-            stick,
-            mean_v2,
-            stick_fraction,
-            friction_power,
-            control_power,
-            x_min,
-            x_max,
-            normal_force,
-        ) = kernel.control_interval(*self._constants, self._x, self._v, v_belt_before, a)
-        interval = self._interval
-        self._belt_travel += 0.5 * (v_belt_before + v_belt) * interval
-        self._x = x
-        self._v = v
-        self._v_belt = v_belt
-        self._mode = mode
-        self._steps = steps = self._steps + 1
-        reward = vibration + effort + stick
-        if -reward > self._worst_cost:
-            self._worst_cost = -reward
-        terminated = False
-        truncated = steps >= self._last_step
         # A copy of what has all the names is much faster than a new dictionary.
         info = _STEP_INFO.copy()
-        info["x"] = x
-        info["v"] = v
-        info["v_belt"] = v_belt
-        info["v_rel"] = v - v_belt
-        info["mode"] = mode
-        info["normal_force"] = normal_force
-        info["time"] = steps * interval
+        (
+            info["x"],
+            info["v"],
+            info["v_belt"],
+            info["v_rel"],
+            info["mode"],
+            info["normal_force"],
+            info["time"],
+            info["force"],
+            info["belt_acceleration"],
+            info["x_min"],
+            info["x_max"],
+            info["mean_square_velocity"],
+            info["stick_fraction"],
+            info["friction_power"],
+            info["control_power"],
+            info["events"],
+            status,
+            info["reward_vibration"],
+            info["reward_effort"],
+            info["reward_stick"],
+            info["reward_contact_loss"],
+            reward,
+            terminated,
+            truncated,
+        ) = kernel.step_alone(self._memory, self._observations, a)
         info["action"] = a
-        info["force"] = force
-        info["belt_acceleration"] = a_belt
-        info["x_min"] = x_min
-        info["x_max"] = x_max
-        info["mean_square_velocity"] = mean_v2
-        info["stick_fraction"] = stick_fraction
-        info["friction_power"] = friction_power
-        info["control_power"] = control_power
-        info["events"] = events
-        info["reward_vibration"] = vibration
-        info["reward_effort"] = effort
-        info["reward_stick"] = stick
-        contact_loss = 0.0
         if status != kernel.OK:
-            self._ended = True
+            self._running = False
             info["status"] = kernel.STATUS_NAMES[status]
-            terminated = status == kernel.CONTACT_LOST
-            truncated = truncated or not terminated
-            if terminated:
-                steps_left = max(0, self._last_step - steps) + 1
-                contact_loss = -steps_left * max(self.task.contact_loss_cost, self._worst_cost)
-                info["reward_contact_loss"] = contact_loss
-                reward += contact_loss
         if self.reward is not None:
             reward = float(self.reward(info))
+            self._state[kernel.S_RETURN] += reward
         if self.render_mode is not None:
-            self.note_for_picture(x_min, x_max, stick_fraction, force)
+            self._mode = info["mode"]
+            self.note_for_picture(info["x_min"], info["x_max"], info["stick_fraction"], info["force"])
             if self.render_mode == "human":
                 self.render()
-        self._log.append((reward, vibration, effort, stick, contact_loss, x_min, x_max, stick_fraction))
         if terminated or truncated:
-            info["statistics"] = self._statistics()
-        return self._observation(x, v, v_belt), reward, terminated, truncated, info
-
-    def _statistics(self) -> dict[str, Any]:
-        """Return what the episode came to; "late" is the last quarter of its time."""
-        total = vibration = effort = stick = contact_loss = late_stick = 0.0
-        low, high = math.inf, -math.inf
-        late = 0
-        for steps, row in enumerate(self._log, start=self._steps - len(self._log) + 1):
-            total += row[0]
-            vibration += row[1]
-            effort += row[2]
-            stick += row[3]
-            contact_loss += row[4]
-            if steps > self.task.late_steps:
-                low, high = min(low, row[5]), max(high, row[6])
-                late_stick += row[7]
-                late += 1
-        values = (
-            total if self.reward is not None else vibration + effort + stick + contact_loss,
-            len(self._log),
-            amplitude(low, high) if late else math.nan,
-            late_stick / late if late else math.nan,
-            vibration,
-            effort,
-            stick,
-            contact_loss,
-        )
-        return dict(zip(EPISODE_STATISTICS, values, strict=True))
-
-    def _observation(self, x: float, v: float, v_belt: float) -> NDArray[np.float32]:
-        shape, limit, plain, full_state, sees_belt, x_offset, x_scale, v_scale, belt_speed, authority = self._optics
-        if not plain:
-            x, v = self._sensed(x, v)
-        observation = np.empty(shape, np.float32)
-        value = (x - x_offset) / x_scale
-        observation[0] = value if -limit <= value <= limit else math.copysign(limit, value)
-        place = 1
-        if full_state:
-            value = v / v_scale
-            observation[1] = value if -limit <= value <= limit else math.copysign(limit, value)
-            place = 2
-            if sees_belt:
-                value = (v_belt / belt_speed - 1.0) / authority
-                observation[2] = value if -limit <= value <= limit else math.copysign(limit, value)
-                place = 3
-        if self._shown:
-            observation[place:] = self._shown
-        return observation
-
-    def _sensed(self, x: float, v: float) -> tuple[float, float]:
-        """Return x and v as the sensor gives them: some intervals old, with the noise of the interval they are from."""
-        if self.task.sensor_noise > 0.0:
-            assert self._key is not None
-            x += self.task.sensor_noise * kernel.random_normal(self._key, self._episode, self._steps + 1, 0)
-            if self._full_state:
-                v += self.task.sensor_noise * kernel.random_normal(self._key, self._episode, self._steps + 1, 1)
-        self._past.append((x, v))
-        return self._past[0]
+            values = episode_statistics(self._state, self._integers, self.reward is not None)
+            info["statistics"] = {name: value.item() for name, value in values.items()}
+        return self._seen.copy(), reward, terminated, truncated, info
 
     def get_state(self) -> EnvState:
         """Return all that the running episode's future depends on, for planning.
@@ -476,21 +371,9 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        if self._steps < 0 or self._key is None:
+        if self._key is None:
             raise gym.error.ResetNeeded("call reset() before get_state(): there is no state yet")
-        return EnvState(
-            parameters=self._parameters,
-            x=self._x,
-            v=self._v,
-            v_belt=self._v_belt,
-            belt_travel=self._belt_travel,
-            steps=self._steps,
-            ended=self._ended,
-            worst_cost=self._worst_cost,
-            key=self._key,
-            episode=self._episode,
-            past=tuple(self._past),
-        )
+        return read_state(self._parameters, self._state, self._integers, self._past, 0)
 
     def set_state(self, state: EnvState) -> None:
         """Go back to a state that :meth:`get_state` returned: what follows is the same, bit for bit.
@@ -503,15 +386,9 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if not isinstance(state, EnvState):
             raise TypeError(f"state must be an EnvState as get_state() returns it, got {state!r}")
         self._use(state.parameters)
-        self._x, self._v, self._v_belt = state.x, state.v, state.v_belt
-        self._belt_travel = state.belt_travel
-        self._steps = state.steps
-        self._ended = state.ended
-        self._worst_cost = state.worst_cost
-        self._key, self._episode = state.key, state.episode
-        self._past.clear()
-        self._log.clear()
-        self._past.extend(state.past)
+        write_state(state, self._state, self._integers, self._past, 0)
+        self._key = state.key
+        self._running = not state.ended
         self._mode = kernel.mode_of(state.parameters.plant, state.x, state.v, state.v_belt, 0.0, 0.0)
 
     def note_for_picture(self, x_min: float, x_max: float, stick_fraction: float, force: float) -> None:
@@ -545,18 +422,19 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._renderer is None:
             self._renderer = Renderer(self.render_mode, fps=self.metadata["render_fps"])
         p, task = self._parameters, self.task
-        intervals = stick_intervals(p.replace(belt_speed=self._v_belt)) if self._v_belt >= 0.0 else []
-        interval = min(intervals, key=lambda ends: abs(0.5 * (ends[0] + ends[1]) - self._x), default=None)
-        lows, highs, sticks = zip(*self._window, strict=True) if self._window else ((self._x,), (self._x,), (0.0,))
+        x, v, v_belt, belt_travel = self._state[kernel.S_X : kernel.S_TRAVEL + 1, 0].tolist()
+        intervals = stick_intervals(p.replace(belt_speed=v_belt)) if v_belt >= 0.0 else []
+        interval = min(intervals, key=lambda ends: abs(0.5 * (ends[0] + ends[1]) - x), default=None)
+        lows, highs, sticks = zip(*self._window, strict=True) if self._window else ((x,), (x,), (0.0,))
         by_belt = task.belt_authority * p.belt_speed if task.actuator == "belt_speed" else 0.0
         return self._renderer.draw(
             Scene(
-                time=max(self._steps, 0) * self._interval,
-                x=self._x,
-                v=self._v,
-                v_belt=self._v_belt,
+                time=int(self._integers[kernel.I_STEPS, 0]) * task.control_interval,
+                x=x,
+                v=v,
+                v_belt=v_belt,
                 mode=self._mode,
-                belt_travel=self._belt_travel,
+                belt_travel=belt_travel,
                 force=self._force,
                 force_limit=task.force_limit if task.actuator == "force" else 0.0,
                 belt_speed_nominal=p.belt_speed,
@@ -574,6 +452,96 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+
+def task_arrays(task: Task) -> tuple[FloatArray, IntegerArray]:
+    """Return what compiled code needs of a task: numbers and codes, as the kernel names their places."""
+    numbers = np.zeros(kernel.TASK_NUMBERS)
+    numbers[kernel.T_AUTHORITY] = task.authority
+    numbers[kernel.T_A_LIMIT] = task.belt_acceleration_limit
+    numbers[kernel.T_INTERVAL] = task.control_interval
+    numbers[kernel.T_W_EFFORT] = task.w_effort
+    numbers[kernel.T_W_STICK] = task.w_stick
+    numbers[kernel.T_CONTACT_LOSS_COST] = task.contact_loss_cost
+    numbers[kernel.T_LIMIT] = task.observation_limit
+    numbers[kernel.T_X_OFFSET] = task.x_offset
+    numbers[kernel.T_X_SCALE] = task.x_scale
+    numbers[kernel.T_V_SCALE] = task.v_scale
+    numbers[kernel.T_BELT_AUTHORITY] = task.belt_authority or 1.0
+    numbers[kernel.T_SENSOR_NOISE] = task.sensor_noise
+    codes = np.zeros(kernel.TASK_CODES, np.int64)
+    codes[kernel.T_ACTUATOR] = ACTUATOR_CODES[task.actuator]
+    codes[kernel.T_EPISODE_STEPS] = task.episode_steps
+    codes[kernel.T_LATE_STEPS] = task.late_steps
+    codes[kernel.T_FULL_STATE] = task.sensor == "state"
+    codes[kernel.T_SEES_BELT] = task.sensor == "state" and task.actuator == "belt_speed"
+    codes[kernel.T_SENSOR_DELAY] = task.sensor_delay
+    return numbers, codes
+
+
+def blank_episode(state: FloatArray, integers: IntegerArray, which: Any) -> None:
+    """Set all that an episode counts and sums up to its beginning, in the columns ``which``."""
+    state[kernel.S_TRAVEL :, which] = 0.0
+    state[kernel.S_LATE_LOW, which] = np.inf
+    state[kernel.S_LATE_HIGH, which] = -np.inf
+    for row in (kernel.I_STEPS, kernel.I_FIRST_STEP, kernel.I_SEEN, kernel.I_OVER, kernel.I_STATUS):
+        integers[row, which] = 0
+
+
+def episode_statistics(state: FloatArray, integers: IntegerArray, replaced: bool) -> dict[str, NDArray[Any]]:
+    """Return what episodes came to, by the names of ``EPISODE_STATISTICS``, each (k,).
+
+    Args:
+        state, integers: the columns of k environments.
+        replaced: whether a function of the user's replaces the reward.
+    """
+    late = np.where(state[kernel.S_LATE_TIME] > 0.0, state[kernel.S_LATE_TIME], np.nan)
+    vibration, effort, stick, contact_loss = state[kernel.S_VIBRATION : kernel.S_CONTACT_LOSS + 1]
+    with np.errstate(invalid="ignore"):
+        values = (
+            state[kernel.S_RETURN] if replaced else vibration + effort + stick + contact_loss,
+            integers[kernel.I_STEPS] - integers[kernel.I_FIRST_STEP],
+            amplitude(state[kernel.S_LATE_LOW], state[kernel.S_LATE_HIGH]) + 0.0 * late,
+            state[kernel.S_LATE_STICK] / late,
+            vibration,
+            effort,
+            stick,
+            contact_loss,
+        )
+    return dict(zip(EPISODE_STATISTICS, values, strict=True))
+
+
+def read_state(
+    parameters: OscillatorParameters, state: FloatArray, integers: IntegerArray, past: FloatArray, i: int
+) -> EnvState:
+    """Return the state of environment ``i``; arrays as the kernel has them."""
+    counts = integers[:, i].tolist()
+    memory, seen = len(past), counts[kernel.I_SEEN]
+    return EnvState(
+        parameters=parameters,
+        x=float(state[kernel.S_X, i]),
+        v=float(state[kernel.S_V, i]),
+        v_belt=float(state[kernel.S_BELT, i]),
+        belt_travel=float(state[kernel.S_TRAVEL, i]),
+        steps=counts[kernel.I_STEPS],
+        ended=counts[kernel.I_OVER] == kernel.ENDED,
+        worst_cost=float(state[kernel.S_WORST, i]),
+        key=counts[kernel.I_KEY],
+        episode=counts[kernel.I_EPISODE],
+        past=tuple(tuple(past[k % memory, :, i].tolist()) for k in range(max(0, seen - memory), seen)),
+    )
+
+
+def write_state(saved: EnvState, state: FloatArray, integers: IntegerArray, past: FloatArray, i: int) -> None:
+    """Put what :func:`read_state` returned into the arrays of environment ``i``, an episode that has just begun."""
+    state[kernel.S_X : kernel.S_WORST + 1, i] = (saved.x, saved.v, saved.v_belt, saved.belt_travel, saved.worst_cost)
+    integers[kernel.I_KEY, i], integers[kernel.I_EPISODE, i] = saved.key, saved.episode
+    integers[kernel.I_STEPS, i] = integers[kernel.I_FIRST_STEP, i] = saved.steps
+    integers[kernel.I_OVER, i] = kernel.ENDED if saved.ended else kernel.RUNNING
+    if len(past):
+        integers[kernel.I_SEEN, i] = len(saved.past)
+        for k, pair in enumerate(saved.past[-len(past) :]):
+            past[k, :, i] = pair
 
 
 def as_parameters(parameters: Any) -> OscillatorParameters:

@@ -1762,6 +1762,134 @@ def observe(task, codes, state, integers, past, shown, observations, which):
             observations[i, place + j] = shown[i, j]
 
 
+# One environment on its own keeps its arrays in a single one, for each that is handed over costs a call more time.
+
+
+@compiled
+def arrays_in(memory):
+    """Return the arrays that lie in the flat ``memory`` of one environment, as a batch of one has them: task (12,),
+    codes (8,), state (21, 1), integers (8, 1), past (delay + 1 or 0, 2, 1) and shown (1, p), in this order."""
+    codes = memory[TASK_NUMBERS : TASK_NUMBERS + TASK_CODES].view(np.int64)
+    first = TASK_NUMBERS + TASK_CODES
+    integers = memory[first : first + INTEGER_ROWS].view(np.int64).reshape((INTEGER_ROWS, 1))
+    first += INTEGER_ROWS
+    state = memory[first : first + STATE_ROWS].reshape((STATE_ROWS, 1))
+    first += STATE_ROWS
+    kept = codes[T_SENSOR_DELAY] + 1 if codes[T_SENSOR_DELAY] > 0 else 0
+    past = memory[first : first + 2 * kept].reshape((kept, 2, 1))
+    shown = memory[first + 2 * kept :].reshape((1, len(memory) - first - 2 * kept))
+    return memory[:TASK_NUMBERS], codes, state, integers, past, shown
+
+
+@compiled
+def step_alone(memory, observations, action):
+    """Step the one environment whose arrays lie in ``memory`` (see :func:`arrays_in`), with an action in [-1, 1].
+
+    Write what it observes into ``observations`` (1, size). Return x, v, v_belt, v_rel, mode, normal force, time, force,
+    belt acceleration, least and greatest x, the means of v^2, of the stick indicator, of the contact force's and the
+    control force's power, events, status, the four reward terms, the reward, and whether the episode was terminated
+    or truncated. The law of the step is :func:`control_interval`'s, and :func:`_account` keeps the same accounts.
+    """
+    task, codes, state, integers, past, shown = arrays_in(memory)
+    interval = task[T_INTERVAL]
+    v_belt_before = state[S_BELT, 0]
+    (
+        x,
+        v,
+        v_belt,
+        mode,
+        status,
+        events,
+        force,
+        a_belt,
+        vibration,
+        effort,
+        stick,
+        mean_v2,
+        stick_fraction,
+        friction_power,
+        control_power,
+        x_min,
+        x_max,
+        normal_force,
+    ) = control_interval(
+        integers[I_GEOMETRY, 0],
+        state[S_ALPHA, 0],
+        state[S_G1, 0],
+        state[S_BETA, 0],
+        state[S_MU_S, 0],
+        state[S_K1, 0],
+        state[S_K3, 0],
+        codes[T_ACTUATOR],
+        task[T_AUTHORITY],
+        task[T_A_LIMIT],
+        state[S_BELT_SPEED, 0],
+        interval,
+        task[T_W_EFFORT],
+        task[T_W_STICK],
+        state[S_X, 0],
+        state[S_V, 0],
+        v_belt_before,
+        action,
+    )
+    state[S_X, 0] = x
+    state[S_V, 0] = v
+    state[S_BELT, 0] = v_belt
+    state[S_TRAVEL, 0] += 0.5 * (v_belt_before + v_belt) * interval
+    state[S_VIBRATION, 0] += vibration
+    state[S_EFFORT, 0] += effort
+    state[S_STICK, 0] += stick
+    reward = vibration + effort + stick
+    state[S_WORST, 0] = max(state[S_WORST, 0], -reward)
+    steps = integers[I_STEPS, 0] + 1
+    integers[I_STEPS, 0] = steps
+    if steps > codes[T_LATE_STEPS]:
+        state[S_LATE_LOW, 0] = min(state[S_LATE_LOW, 0], x_min)
+        state[S_LATE_HIGH, 0] = max(state[S_LATE_HIGH, 0], x_max)
+        state[S_LATE_STICK, 0] += stick_fraction
+        state[S_LATE_TIME, 0] += 1.0
+    terminated = False
+    truncated = steps >= codes[T_EPISODE_STEPS]
+    contact_loss = 0.0
+    if status != OK:
+        integers[I_OVER, 0] = ENDED
+        if status == CONTACT_LOST:
+            terminated = True
+            steps_left = max(0, codes[T_EPISODE_STEPS] - steps) + 1
+            contact_loss = -steps_left * max(task[T_CONTACT_LOSS_COST], state[S_WORST, 0])
+            state[S_CONTACT_LOSS, 0] += contact_loss
+            reward += contact_loss
+        else:
+            truncated = True
+    observe(task, codes, state, integers, past, shown, observations, (0,))
+    return (
+        x,
+        v,
+        v_belt,
+        v - v_belt,
+        mode,
+        normal_force,
+        steps * interval,
+        force,
+        a_belt,
+        x_min,
+        x_max,
+        mean_v2,
+        stick_fraction,
+        friction_power,
+        control_power,
+        events,
+        status,
+        vibration,
+        effort,
+        stick,
+        contact_loss,
+        reward,
+        terminated,
+        truncated,
+    )
+
+
 @compiled
 def first_bad(actions):
     """Return the place of the first value of ``actions`` (n,) that is not finite, or -1."""

@@ -191,6 +191,19 @@ class Task:
         drawn = self.draws(np.array([key]), np.array([episode]))
         return nominal.replace(**{name: float(values[0]) for name, values in drawn.items()})
 
+    def shown_parameters(self, values: Mapping[str, Any]) -> FloatArray:
+        """Return what an observation shows of n episodes' parameters, (p, n), or (p,) if ``values`` are no arrays.
+
+        Args:
+            values: of each parameter, by name, each (n,) or a number.
+        """
+        rows = []
+        for name, (low, high) in self.randomise.items():
+            own = np.asarray(values[name])
+            scaled = 2.0 * (own - low) / (high - low) - 1.0 if high > low else np.zeros_like(own)
+            rows.append(np.clip(scaled, -self.observation_limit, self.observation_limit))
+        return np.array(rows)
+
     def start_state(self, parameters: OscillatorParameters, key: int, episode: int) -> tuple[float, float]:
         """Return the (x, v) at which an episode starts."""
         if self.start == "rest":

@@ -13,19 +13,21 @@ from numpy.typing import NDArray
 
 from sd_friction_env import kernel
 from sd_friction_env.env import (
-    ACTUATOR_CODES,
-    EPISODE_STATISTICS,
     EnvState,
     RewardFunction,
     SDFrictionEnv,
+    blank_episode,
     check_belt,
     checked_options,
+    episode_statistics,
+    read_state,
     start_of,
+    task_arrays,
+    write_state,
 )
 from sd_friction_env.parameters import GEOMETRIES, RANGES, OscillatorParameters, checked_choice, checked_number
-from sd_friction_env.simulation import amplitude
 from sd_friction_env.startup import announced
-from sd_friction_env.task import FloatArray, IntegerArray, Task, passive_motion
+from sd_friction_env.task import FloatArray, IntegerArray, passive_motion
 from sd_friction_env.theory import stribeck_coefficients
 
 _MOST_ENVS = 2**24
@@ -174,7 +176,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         task = self.task
         self._geometry = self.nominal.plant.geometry
         self._nominal_numbers = np.array([[getattr(self.nominal, name)] for name in _NUMBERS])
-        self._task_numbers, self._task_codes = _task_arrays(task)
+        self._task_numbers, self._task_codes = task_arrays(task)
         # Rows of an odd number of cache lines: lengths of a power of two would crowd into few places of the cache.
         self._width = n if n < kernel.LANES else 8 * (2 * (n // 16) + 3)
         self._state = np.zeros((kernel.STATE_ROWS, self._width))
@@ -317,12 +319,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         state[kernel.S_K1, which], state[kernel.S_K3, which] = stribeck_coefficients(mu_s, mu_m, v_m)
         speed = parameters[_NUMBERS.index("belt_speed")]
         state[kernel.S_BELT, which] = speed
-        state[kernel.S_TRAVEL :, which] = 0.0
-        state[kernel.S_LATE_LOW, which] = np.inf
-        state[kernel.S_LATE_HIGH, which] = -np.inf
+        blank_episode(state, integers, which)
         integers[kernel.I_GEOMETRY, which] = geometries
-        for row in (kernel.I_STEPS, kernel.I_FIRST_STEP, kernel.I_SEEN, kernel.I_OVER, kernel.I_STATUS):
-            integers[row, which] = 0
         self._own[which] = (geometries != self._geometry) | (parameters != self._nominal_numbers).any(axis=0)
         one_plant = not self._own.any()
         if one_plant and not self._task_codes[kernel.T_ONE_PLANT]:
@@ -330,7 +328,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
                 kernel.fill_plant(work, state[:, which[0]])
         self._task_codes[kernel.T_ONE_PLANT] = one_plant
         if self.task.show_parameters:
-            self._shown[which] = self._scaled_parameters(parameters).T
+            self._shown[which] = self.task.shown_parameters(dict(zip(_NUMBERS, parameters, strict=True))).T
         if placed is None:
             self._place(which, parameters)
         else:
@@ -372,15 +370,6 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         if cycle is not None and cycle.period > 0.0:
             return cycle.x_phase0, cycle.v_phase0, cycle.period
         return *self.task.cycle_state(self.nominal, 0.0), 0.0
-
-    def _scaled_parameters(self, parameters: FloatArray) -> FloatArray:
-        limit = self.task.observation_limit
-        rows = []
-        for name, (low, high) in self.task.randomise.items():
-            values = parameters[_NUMBERS.index(name)]
-            scaled = 2.0 * (values - low) / (high - low) - 1.0 if high > low else np.zeros_like(values)
-            rows.append(np.clip(scaled, -limit, limit))
-        return np.array(rows)
 
     def _observe(self, which: IntegerArray) -> None:
         kernel.observe(
@@ -617,21 +606,10 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
 
     def _statistics(self, which: IntegerArray) -> tuple[dict[str, Any], NDArray[np.bool_]]:
         """Return what the episodes of environments came to."""
-        state = self._state[:, which]
-        steps = self._integers[kernel.I_STEPS, which] - self._integers[kernel.I_FIRST_STEP, which]
-        late = np.where(state[kernel.S_LATE_TIME] > 0.0, state[kernel.S_LATE_TIME], np.nan)
-        terms = state[[kernel.S_VIBRATION, kernel.S_EFFORT, kernel.S_STICK, kernel.S_CONTACT_LOSS]]
-        with np.errstate(invalid="ignore"):
-            values = (
-                ((terms[0] + terms[1]) + terms[2]) + terms[3] if self.reward is None else state[kernel.S_RETURN],
-                steps,
-                amplitude(state[kernel.S_LATE_LOW], state[kernel.S_LATE_HIGH]) + 0.0 * late,
-                state[kernel.S_LATE_STICK] / late,
-                *terms,
-            )
+        values = episode_statistics(self._state[:, which], self._integers[:, which], self.reward is not None)
         mask = self._mask(which)
         statistics: dict[str, Any] = {}
-        for name, entries in zip(EPISODE_STATISTICS, values, strict=True):
+        for name, entries in values.items():
             statistics[name], statistics[f"_{name}"] = self._spread(entries, which), mask
         return statistics, mask
 
@@ -668,23 +646,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         return tuple(self._state_of(i) for i in range(self.num_envs))
 
     def _state_of(self, i: int) -> EnvState:
-        state, integers = self._state[:, i], self._integers[:, i]
-        memory = self.task.sensor_delay + 1
-        seen = int(integers[kernel.I_SEEN]) if len(self._past) else 0
-        past = [self._past[k % memory, :, i].tolist() for k in range(max(0, seen - memory), seen)]
-        return EnvState(
-            parameters=self._as_parameters(self._numbers[:, i], int(integers[kernel.I_GEOMETRY])),
-            x=float(state[kernel.S_X]),
-            v=float(state[kernel.S_V]),
-            v_belt=float(state[kernel.S_BELT]),
-            belt_travel=float(state[kernel.S_TRAVEL]),
-            steps=int(integers[kernel.I_STEPS]),
-            ended=bool(integers[kernel.I_OVER] == kernel.ENDED),
-            worst_cost=float(state[kernel.S_WORST]),
-            key=int(integers[kernel.I_KEY]),
-            episode=int(integers[kernel.I_EPISODE]),
-            past=tuple((x, v) for x, v in past),
-        )
+        parameters = self._as_parameters(self._numbers[:, i], int(self._integers[kernel.I_GEOMETRY, i]))
+        return read_state(parameters, self._state, self._integers, self._past, i)
 
     def set_states(self, states: Sequence[EnvState]) -> None:
         """Go back to states that :meth:`get_states` returned: what follows is the same, bit for bit.
@@ -703,7 +666,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             self._set_state(i, state)
 
     def _set_state(self, i: int, state: EnvState) -> None:
-        own, memory = state.parameters, self.task.sensor_delay + 1
+        own = state.parameters
         which = np.array([i])
         observation = self._observations[i].copy()
         self._integers[kernel.I_KEY, i], self._integers[kernel.I_EPISODE, i] = state.key, state.episode
@@ -711,14 +674,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         here = (np.array([state.x]), np.array([state.v]), np.array([True]))
         self._begin(which, numbers, np.array([own.plant.geometry]), *here)
         self._observations[i] = observation
-        self._state[kernel.S_BELT, i], self._state[kernel.S_TRAVEL, i] = state.v_belt, state.belt_travel
-        self._state[kernel.S_WORST, i] = state.worst_cost
-        self._integers[kernel.I_STEPS, i] = self._integers[kernel.I_FIRST_STEP, i] = state.steps
-        self._integers[kernel.I_OVER, i] = kernel.ENDED if state.ended else kernel.RUNNING
-        if len(self._past):
-            self._integers[kernel.I_SEEN, i] = len(state.past)
-            for k, pair in enumerate(state.past[-memory:]):
-                self._past[k, :, i] = pair
+        write_state(state, self._state, self._integers, self._past, i)
         if not state.ended:
             self._over = self._over[self._over != i]
         self._is_reset = True
@@ -805,31 +761,6 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         for view in self._views.values():
             view.close()
         self._single.close()
-
-
-def _task_arrays(task: Task) -> tuple[FloatArray, IntegerArray]:
-    """Return what compiled code needs of a task that holds for the whole batch."""
-    numbers = np.zeros(kernel.TASK_NUMBERS)
-    numbers[kernel.T_AUTHORITY] = task.authority
-    numbers[kernel.T_A_LIMIT] = task.belt_acceleration_limit
-    numbers[kernel.T_INTERVAL] = task.control_interval
-    numbers[kernel.T_W_EFFORT] = task.w_effort
-    numbers[kernel.T_W_STICK] = task.w_stick
-    numbers[kernel.T_CONTACT_LOSS_COST] = task.contact_loss_cost
-    numbers[kernel.T_LIMIT] = task.observation_limit
-    numbers[kernel.T_X_OFFSET] = task.x_offset
-    numbers[kernel.T_X_SCALE] = task.x_scale
-    numbers[kernel.T_V_SCALE] = task.v_scale
-    numbers[kernel.T_BELT_AUTHORITY] = task.belt_authority or 1.0
-    numbers[kernel.T_SENSOR_NOISE] = task.sensor_noise
-    codes = np.zeros(kernel.TASK_CODES, np.int64)
-    codes[kernel.T_ACTUATOR] = ACTUATOR_CODES[task.actuator]
-    codes[kernel.T_EPISODE_STEPS] = task.episode_steps
-    codes[kernel.T_LATE_STEPS] = task.late_steps
-    codes[kernel.T_FULL_STATE] = task.sensor == "state"
-    codes[kernel.T_SEES_BELT] = task.sensor == "state" and task.actuator == "belt_speed"
-    codes[kernel.T_SENSOR_DELAY] = task.sensor_delay
-    return numbers, codes
 
 
 def _views(

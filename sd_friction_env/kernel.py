@@ -1723,9 +1723,9 @@ def _observed(value, offset, scale, limit):
 def _sense(task, codes, integers, past, x, v, i):
     """Return x and v of environment i as its sensor gives them: some intervals old, with the noise of that time."""
     if task[T_SENSOR_NOISE] > 0.0:
-        key = integers[I_KEY, i]
-        episode = integers[I_EPISODE, i]
-        step = integers[I_STEPS, i] + 1
+        key = int(integers[I_KEY, i])
+        episode = int(integers[I_EPISODE, i])
+        step = int(integers[I_STEPS, i]) + 1
         x += task[T_SENSOR_NOISE] * random_normal(key, episode, step, 0)
         if codes[T_FULL_STATE]:
             v += task[T_SENSOR_NOISE] * random_normal(key, episode, step, 1)

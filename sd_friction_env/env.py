@@ -248,11 +248,10 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Begin anew with these parameters, the belt at its nominal speed."""
         self._parameters = parameters
         geometry, *numbers = parameters.plant
-        state, integers = self._state[:, 0], self._integers[:, 0]
-        blank_episode(self._state, self._integers, slice(None))
-        integers[kernel.I_GEOMETRY] = geometry
-        state[: kernel.S_BELT_SPEED] = numbers
-        state[kernel.S_BELT_SPEED] = state[kernel.S_BELT] = parameters.belt_speed
+        self._integers[kernel.I_GEOMETRY] = geometry
+        self._state[: kernel.S_BELT_SPEED, 0] = numbers
+        self._state[kernel.S_BELT_SPEED] = parameters.belt_speed
+        kernel.blank_episodes(self._state, self._integers, (0,))
         if self.task.show_parameters:
             self._shown[0] = self.task.shown_parameters(dataclasses.asdict(parameters))
 
@@ -361,8 +360,9 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             if self.render_mode == "human":
                 self.render()
         if terminated or truncated:
-            values = episode_statistics(self._state, self._integers, self.reward is not None)
-            info["statistics"] = {name: value.item() for name, value in values.items()}
+            values = np.empty((len(EPISODE_STATISTICS), 1))
+            kernel.episode_statistics(self._state, self._integers, (0,), self.reward is not None, values)
+            info["statistics"] = {name: value.item() for name, value in named_statistics(values).items()}
         return self._seen.copy(), reward, terminated, truncated, info
 
     def get_state(self) -> EnvState:
@@ -479,36 +479,11 @@ def task_arrays(task: Task) -> tuple[FloatArray, IntegerArray]:
     return numbers, codes
 
 
-def blank_episode(state: FloatArray, integers: IntegerArray, which: Any) -> None:
-    """Set all that an episode counts and sums up to its beginning, in the columns ``which``."""
-    state[kernel.S_TRAVEL :, which] = 0.0
-    state[kernel.S_LATE_LOW, which] = np.inf
-    state[kernel.S_LATE_HIGH, which] = -np.inf
-    for row in (kernel.I_STEPS, kernel.I_FIRST_STEP, kernel.I_SEEN, kernel.I_OVER, kernel.I_STATUS):
-        integers[row, which] = 0
-
-
-def episode_statistics(state: FloatArray, integers: IntegerArray, replaced: bool) -> dict[str, NDArray[Any]]:
-    """Return what episodes came to, by the names of ``EPISODE_STATISTICS``, each (k,).
-
-    Args:
-        state, integers: the columns of k environments.
-        replaced: whether a function of the user's replaces the reward.
-    """
-    late = np.where(state[kernel.S_LATE_TIME] > 0.0, state[kernel.S_LATE_TIME], np.nan)
-    vibration, effort, stick, contact_loss = state[kernel.S_VIBRATION : kernel.S_CONTACT_LOSS + 1]
-    with np.errstate(invalid="ignore"):
-        values = (
-            state[kernel.S_RETURN] if replaced else vibration + effort + stick + contact_loss,
-            integers[kernel.I_STEPS] - integers[kernel.I_FIRST_STEP],
-            amplitude(state[kernel.S_LATE_LOW], state[kernel.S_LATE_HIGH]) + 0.0 * late,
-            state[kernel.S_LATE_STICK] / late,
-            vibration,
-            effort,
-            stick,
-            contact_loss,
-        )
-    return dict(zip(EPISODE_STATISTICS, values, strict=True))
+def named_statistics(values: FloatArray) -> dict[str, NDArray[Any]]:
+    """Return what ``kernel.episode_statistics`` wrote (8, n) by name, each (n,)."""
+    statistics: dict[str, NDArray[Any]] = dict(zip(EPISODE_STATISTICS, values, strict=True))
+    statistics["length"] = statistics["length"].astype(np.int64)
+    return statistics
 
 
 def read_state(

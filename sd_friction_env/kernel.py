@@ -2258,36 +2258,133 @@ def _plant_of(state, integers, i):
     )
 
 
-@compiled
-def cycle_starts(state, integers, which, phases, x_phase0, v_phase0, period, drawn):
-    """Put the environments ``which`` (k,) on the passive limit cycle at ``phases`` (k,).
+CYCLE_POINTS = 64
 
-    Without ``drawn`` the cycle is the given one (a period of 0: a state and no more). With it each environment has a
-    cycle of its own, the one that a mass set down at x = 0 with the belt reaches. Return (k,) flags, 1 where that is
-    no stick-slip cycle that is found at once: those states are left alone.
-    """
+
+@compiled
+def cycle_points(plant, x, v, v_belt, period):
+    """Return the states (CYCLE_POINTS, 2) at phases 0, 1/CYCLE_POINTS, ... of a passive motion with this state at
+    phase 0: a start at any phase is then a short way. A period of 0 means a state and no more."""
+    points = np.empty((CYCLE_POINTS, 2))
+    for j in range(CYCLE_POINTS):
+        points[j, 0] = x
+        points[j, 1] = v
+        if period > 0.0:
+            end = advance(plant, x, v, v_belt, 0.0, 0.0, period / CYCLE_POINTS, None)
+            x, v = end[0], end[1]
+    return points
+
+
+@compiled
+def _point_before(phase):
+    """Return the number of the last of CYCLE_POINTS that is not after a phase in [0, 1]."""
+    return min(int(phase * CYCLE_POINTS), CYCLE_POINTS - 1)
+
+
+@compiled
+def cycle_state(plant, points, v_belt, period, phase):
+    """Return (x, v) at a phase in [0, 1] of the motion whose :func:`cycle_points` are given."""
+    j = _point_before(phase)
+    x, v = points[j, 0], points[j, 1]
+    duration = (phase * CYCLE_POINTS - j) * (period / CYCLE_POINTS)
+    if duration > 0.0:
+        end = advance(plant, x, v, v_belt, 0.0, 0.0, duration, None)
+        x, v = end[0], end[1]
+    return x, v
+
+
+@compiled
+def own_cycle_starts(state, integers, which, phases):
+    """Put the environments ``which`` (k,) at ``phases`` (k,) of the cycles that a mass set down at x = 0 with the belt
+    reaches, each of its own. Return (k,) flags, 1 where that is no stick-slip cycle that is found at once: those states
+    are left alone."""
     left = np.zeros(len(which), dtype=np.uint8)
     exits = np.empty(SETTLING_EXITS)
     for j in range(len(which)):
         i = which[j]
         speed = state[S_BELT_SPEED, i]
         plant = _plant_of(state, integers, i)
-        x, v, duration = x_phase0, v_phase0, phases[j] * period
-        if drawn:
-            outcome, x, _, _ = settle(plant, speed, 0.0, speed, SETTLING_LAPS, exits)
-            if outcome == REPEATED_BREAKAWAY:
-                lap = stick_slip_lap(plant, speed, x)
-                outcome = lap[0]
-                v, duration = speed, phases[j] * lap[1]
-            if outcome != REPEATED_BREAKAWAY:
-                left[j] = 1
-                continue
+        left[j] = 1
+        outcome, x, _, _ = settle(plant, speed, 0.0, speed, SETTLING_LAPS, exits)
+        if outcome != REPEATED_BREAKAWAY:
+            continue
+        lap = stick_slip_lap(plant, speed, x)
+        if lap[0] != REPEATED_BREAKAWAY:
+            continue
+        # The same steps as cycle_points and cycle_state take, but only as far as needed.
+        v, period = speed, lap[1]
+        before = _point_before(phases[j])
+        for _ in range(before):
+            end = advance(plant, x, v, speed, 0.0, 0.0, period / CYCLE_POINTS, None)
+            x, v = end[0], end[1]
+        duration = (phases[j] * CYCLE_POINTS - before) * (period / CYCLE_POINTS)
         if duration > 0.0:
             end = advance(plant, x, v, speed, 0.0, 0.0, duration, None)
             x, v = end[0], end[1]
         state[S_X, i] = x
         state[S_V, i] = v
+        left[j] = 0
     return left
+
+
+@compiled
+def blank_episodes(state, integers, which):
+    """Set all that an episode counts and sums up to its beginning, and the belt to its nominal speed."""
+    for i in which:
+        for row in range(S_TRAVEL, STATE_ROWS):
+            state[row, i] = 0.0
+        state[S_BELT, i] = state[S_BELT_SPEED, i]
+        state[S_LATE_LOW, i] = math.inf
+        state[S_LATE_HIGH, i] = -math.inf
+        integers[I_STEPS, i] = 0
+        integers[I_FIRST_STEP, i] = 0
+        integers[I_SEEN, i] = 0
+        integers[I_OVER, i] = RUNNING
+        integers[I_STATUS, i] = OK
+
+
+@compiled
+def place_on_cycle(state, integers, which, points, period, slot):
+    """Put the environments ``which`` (k,) at random phases (numbers of ``slot``) of the passive motion with these
+    :func:`cycle_points`."""
+    for i in which:
+        phase = random_uniform(int(integers[I_KEY, i]), int(integers[I_EPISODE, i]), 0, slot)
+        plant = _plant_of(state, integers, i)
+        state[S_X, i], state[S_V, i] = cycle_state(plant, points, state[S_BELT_SPEED, i], period, phase)
+
+
+@compiled
+def restart(task, codes, state, integers, past, shown, observations, which, points, period, slot):
+    """Begin the next episodes of the environments ``which`` (k,), with the parameters that they have, where
+    :func:`place_on_cycle` puts them; observe them."""
+    for i in which:
+        integers[I_EPISODE, i] += 1
+    blank_episodes(state, integers, which)
+    place_on_cycle(state, integers, which, points, period, slot)
+    observe(task, codes, state, integers, past, shown, observations, which)
+
+
+@compiled
+def episode_statistics(state, integers, which, replaced, values):
+    """Write what the episodes of the environments ``which`` (k,) came to into their columns of ``values`` (8, n).
+
+    Rows: return, length, late amplitude, late stick fraction and the four reward terms. "Late" is the last quarter of
+    an episode's time, NaN if it was not reached. ``replaced``: whether a function of the user's gave the rewards.
+    """
+    for i in which:
+        vibration = state[S_VIBRATION, i]
+        effort = state[S_EFFORT, i]
+        stick = state[S_STICK, i]
+        contact_loss = state[S_CONTACT_LOSS, i]
+        late = state[S_LATE_TIME, i]
+        values[0, i] = state[S_RETURN, i] if replaced else vibration + effort + stick + contact_loss
+        values[1, i] = integers[I_STEPS, i] - integers[I_FIRST_STEP, i]
+        values[2, i] = 0.5 * (state[S_LATE_HIGH, i] - state[S_LATE_LOW, i]) if late > 0.0 else math.nan
+        values[3, i] = state[S_LATE_STICK, i] / late if late > 0.0 else math.nan
+        values[4, i] = vibration
+        values[5, i] = effort
+        values[6, i] = stick
+        values[7, i] = contact_loss
 
 
 @compiled

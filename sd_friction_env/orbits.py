@@ -7,6 +7,7 @@ matters near the end of oscillation, where transients decay ever more slowly.
 
 import cmath
 import contextlib
+import functools
 import itertools
 import math
 from collections.abc import Callable
@@ -18,7 +19,7 @@ import numpy as np
 from sd_friction_env import kernel
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_number
 from sd_friction_env.simulation import amplitude
-from sd_friction_env.theory import cubic_wells, exact_wells
+from sd_friction_env.theory import FloatArray, cubic_wells, exact_wells
 
 Kind = Literal["stick-slip", "pure-slip", "steady-slip", "rest"]
 
@@ -89,8 +90,15 @@ class LimitCycle:
         if not self.period > 0.0:
             return self.x_phase0, self.v_phase0
         p = self.parameters
-        end = kernel.advance(p.plant, self.x_phase0, self.v_phase0, p.belt_speed, 0.0, 0.0, phase * self.period, None)
-        return end[0], end[1]
+        state: tuple[float, float] = kernel.cycle_state(p.plant, self.points, p.belt_speed, self.period, phase)
+        return state
+
+    @functools.cached_property
+    def points(self) -> FloatArray:
+        """States (x, v) at evenly spaced phases from 0 on, (64, 2); a steady state has but one."""
+        p, period = self.parameters, self.period if self.period > 0.0 else 0.0
+        points: FloatArray = kernel.cycle_points(p.plant, self.x_phase0, self.v_phase0, p.belt_speed, period)
+        return points
 
 
 class CriticalBeltSpeeds(NamedTuple("_CriticalBeltSpeeds", [("v_b0", float), ("v_b1", float)])):

@@ -23,7 +23,7 @@ IntegerArray: TypeAlias = NDArray[np.int64]
 RANDOMISABLE = ("alpha", "g1", "beta", "mu_s", "mu_m", "v_m", "belt_speed")
 
 # Slots of the counter-based generator at step 0 of an episode; sensor noise uses the steps from 1 on.
-_PHASE_SLOT, _X_SLOT, _V_SLOT, _PARAMETER_SLOT = 0, 1, 2, 8
+PHASE_SLOT, _X_SLOT, _V_SLOT, _PARAMETER_SLOT = 0, 1, 2, 8  # of the random numbers with which an episode begins
 
 _RANGES: dict[str, tuple[float, float]] = {
     "force_limit": (0.0, 100.0),
@@ -172,7 +172,7 @@ class Task:
 
     def phases(self, keys: IntegerArray, episodes: IntegerArray) -> FloatArray:
         """Return the phases of the passive cycle at which n episodes start, (n,)."""
-        phases: FloatArray = kernel.random_uniforms(keys, episodes, 0, _PHASE_SLOT)
+        phases: FloatArray = kernel.random_uniforms(keys, episodes, 0, PHASE_SLOT)
         return phases
 
     def random_states(self, keys: IntegerArray, episodes: IntegerArray) -> tuple[FloatArray, FloatArray]:

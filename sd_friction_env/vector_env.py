@@ -13,21 +13,22 @@ from numpy.typing import NDArray
 
 from sd_friction_env import kernel
 from sd_friction_env.env import (
+    EPISODE_STATISTICS,
     EnvState,
     RewardFunction,
     SDFrictionEnv,
-    blank_episode,
     check_belt,
     checked_options,
-    episode_statistics,
+    named_statistics,
     read_state,
     start_of,
     task_arrays,
     write_state,
 )
+from sd_friction_env.orbits import rest_place
 from sd_friction_env.parameters import GEOMETRIES, RANGES, OscillatorParameters, checked_choice, checked_number
 from sd_friction_env.startup import announced
-from sd_friction_env.task import FloatArray, IntegerArray, passive_motion
+from sd_friction_env.task import PHASE_SLOT, FloatArray, IntegerArray, passive_motion
 from sd_friction_env.theory import stribeck_coefficients
 
 _MOST_ENVS = 2**24
@@ -188,6 +189,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self._works = np.ones((shares, kernel.WORK_SIZE))
         self._task_codes[kernel.T_TRAVEL] = render_mode is not None
         self._own = np.zeros(n, np.bool_)  # who has other parameters than the nominal ones
+        # Whether compiled code alone can begin the next episode of one with the nominal parameters.
+        self._restarts_alike = task.start != "random" and not task.randomise
         self._stepper = (kernel.STEPPERS if shares == 1 else kernel.STEPPERS_IN_THREADS)[self._geometry]
         self._is_warm = False
         # Every share but the last is made of whole blocks.
@@ -317,10 +320,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             state[row, which] = parameters[_NUMBERS.index(name)]
         mu_s, mu_m, v_m = (parameters[_NUMBERS.index(name)] for name in ("mu_s", "mu_m", "v_m"))
         state[kernel.S_K1, which], state[kernel.S_K3, which] = stribeck_coefficients(mu_s, mu_m, v_m)
-        speed = parameters[_NUMBERS.index("belt_speed")]
-        state[kernel.S_BELT, which] = speed
-        blank_episode(state, integers, which)
         integers[kernel.I_GEOMETRY, which] = geometries
+        kernel.blank_episodes(state, integers, which)
         self._own[which] = (geometries != self._geometry) | (parameters != self._nominal_numbers).any(axis=0)
         one_plant = not self._own.any()
         if one_plant and not self._task_codes[kernel.T_ONE_PLANT]:
@@ -337,8 +338,12 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             state[kernel.S_X, which], state[kernel.S_V, which] = x, v
             self._place(which[~placed], parameters[:, ~placed])
         self._observe(which)
-        for i in self._views.keys() & set(which.tolist()):
-            self._views[i].clear_picture()
+        self._clear_pictures(which)
+
+    def _clear_pictures(self, which: IntegerArray) -> None:
+        if self._views:
+            for i in self._views.keys() & set(which.tolist()):
+                self._views[i].clear_picture()
 
     def _place(self, which: IntegerArray, parameters: FloatArray) -> None:
         """Put environments where the task starts its episodes."""
@@ -350,26 +355,27 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             state[kernel.S_X, which], state[kernel.S_V, which] = task.random_states(keys, episodes)
             return
         own = self._own[which]
-        left = which
-        if task.start == "cycle":
-            phases = task.phases(keys, episodes)
-            with announced("starts in a batch"):
-                x, v, period = self._nominal_cycle
-                kernel.cycle_starts(state, self._integers, which[~own], phases[~own], x, v, period, False)
-                unknown = kernel.cycle_starts(state, self._integers, which[own], phases[own], 0.0, 0.0, 0.0, True)
-            left = which[own][unknown == 1]
+        left = which[own]
+        with announced("starts in a batch"):
+            kernel.place_on_cycle(state, self._integers, which[~own], *self._nominal_start)
+            if task.start == "cycle":
+                left = left[kernel.own_cycle_starts(state, self._integers, left, task.phases(keys, episodes)[own]) == 1]
         for i in left.tolist():
             j = int(np.searchsorted(which, i))
             single = self._as_parameters(parameters[:, j], int(self._integers[kernel.I_GEOMETRY, i]))
             state[kernel.S_X, i], state[kernel.S_V, i] = task.start_state(single, int(keys[j]), int(episodes[j]))
 
     @functools.cached_property
-    def _nominal_cycle(self) -> tuple[float, float, float]:
-        """The state at phase 0 of the nominal passive motion, and its period (0 where nothing oscillates)."""
+    def _nominal_start(self) -> tuple[FloatArray, float, int]:
+        """Where episodes with the nominal parameters begin that do not begin at random: points of the passive motion,
+        its period (0 for a state and no more) and the slot of the random numbers that choose the phase."""
         cycle = passive_motion(self.nominal)
-        if cycle is not None and cycle.period > 0.0:
-            return cycle.x_phase0, cycle.v_phase0, cycle.period
-        return *self.task.cycle_state(self.nominal, 0.0), 0.0
+        if self.task.start == "cycle" and cycle is not None and cycle.period > 0.0:
+            return cycle.points, cycle.period, PHASE_SLOT
+        place = (
+            (rest_place(self.nominal), 0.0) if self.task.start == "rest" else self.task.cycle_state(self.nominal, 0.0)
+        )
+        return np.array([place] * kernel.CYCLE_POINTS), 0.0, PHASE_SLOT
 
     def _observe(self, which: IntegerArray) -> None:
         kernel.observe(
@@ -563,6 +569,20 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
 
     def _restart(self, which: IntegerArray) -> None:
         """Start the next episodes of environments."""
+        if self._restarts_alike and not self._own[which].any():
+            kernel.restart(
+                self._task_numbers,
+                self._task_codes,
+                self._state,
+                self._integers,
+                self._past,
+                self._shown,
+                self._observations,
+                which,
+                *self._nominal_start,
+            )
+            self._clear_pictures(which)
+            return
         self._integers[kernel.I_EPISODE, which] += 1
         keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which]
         self._begin(which, *self._drawn(keys, episodes))
@@ -571,17 +591,19 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         """Let info say of environments that they have been reset."""
         mask = self._mask(which)
         stepped = ~mask
+        nobody_stepped = len(which) == self.num_envs
+        tells_start = False
         for name in self.step_keys:
             if name in RESET_KEYS:
-                continue
-            if not stepped.any():  # nobody has anything to say of a step
+                tells_start = True
+            elif nobody_stepped:
                 del info[name], info[f"_{name}"]
-                continue
-            if name == "status":
-                info[name] = info[name].copy()
-            info[name][which] = None if name == "status" else 0
-            info[f"_{name}"] = stepped
-        if not self.info_keys.isdisjoint(RESET_KEYS):
+            else:
+                if name == "status":
+                    info[name] = info[name].copy()
+                info[name][which] = None if name == "status" else 0
+                info[f"_{name}"] = stepped
+        if tells_start:
             for name, start in self._at_start(which).items():
                 if name in self.info_keys:
                     info[name][which] = start
@@ -606,11 +628,12 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
 
     def _statistics(self, which: IntegerArray) -> tuple[dict[str, Any], NDArray[np.bool_]]:
         """Return what the episodes of environments came to."""
-        values = episode_statistics(self._state[:, which], self._integers[:, which], self.reward is not None)
+        values = np.zeros((len(EPISODE_STATISTICS), self.num_envs))
+        kernel.episode_statistics(self._state, self._integers, which, self.reward is not None, values)
         mask = self._mask(which)
         statistics: dict[str, Any] = {}
-        for name, entries in values.items():
-            statistics[name], statistics[f"_{name}"] = self._spread(entries, which), mask
+        for name, entries in named_statistics(values).items():
+            statistics[name], statistics[f"_{name}"] = entries, mask
         return statistics, mask
 
     def stagger(self) -> None:

@@ -1893,10 +1893,10 @@ def step_alone(memory, observations, action):
 @compiled
 def first_bad(actions):
     """Return the place of the first value of ``actions`` (n,) that is not finite, or -1."""
-    total = 0.0
-    for i in range(len(actions)):
-        total += abs(actions[i]) * 0.0
-    if total == 0.0:
+    bad = 0
+    for i in range(len(actions)):  # counting is done in vector instructions, adding numbers or leaving early is not
+        bad += 0 if abs(actions[i]) < math.inf else 1
+    if bad == 0:
         return -1
     for i in range(len(actions)):
         if not math.isfinite(actions[i]):

@@ -111,7 +111,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
 
     A dictionary of arrays as Gymnasium's own vector environments have it: beside each array "name" stands a mask
     "_name" (all masks that are true throughout are one read-only array). ``reset`` tells everything; a step tells the
-    ``info_keys``, by default the reward's terms and the status, for at this speed all else costs more than it is worth
+    ``info_keys``, by default the reward's terms, for at this speed all else costs more than it is worth
     to most: ``info_keys="all"`` tells what the single environment tells. When episodes end, ``statistics`` holds their
     return, length, late amplitude and so on (see :class:`SDFrictionEnv`).
 
@@ -146,7 +146,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         render_mode: str | None = None,
         render_envs: Iterable[int] | None = None,
         reward: RewardFunction | None = None,
-        info_keys: Sequence[str] | Literal["all"] = (*REWARD_TERMS, "status"),
+        info_keys: Sequence[str] | Literal["all"] = REWARD_TERMS,
         **task_arguments: Any,
     ) -> None:
         super().__init__()
@@ -200,6 +200,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         shape = self.single_observation_space.shape
         assert shape is not None
         self._observations = np.zeros((n, *shape), np.float32)
+        self._actions = np.zeros(n)
         self._kept: _Buffers | None = None
         self._no_codes = np.empty((0, self._width), np.int64)
         self._everyone = np.arange(n)
@@ -509,12 +510,15 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     def _checked_actions(self, actions: Any) -> FloatArray:
         expected = f"actions must be finite numbers in an array of shape ({self.num_envs}, 1)"
         try:
-            array = np.asarray(actions, dtype=np.float64)
+            array = np.asarray(actions)
+            if array.dtype not in (np.float32, np.float64):
+                array = array.astype(np.float64)
         except (TypeError, ValueError):
             raise TypeError(f"{expected}, got {actions!r}") from None
         if array.shape != (self.num_envs, 1):
             raise ValueError(f"{expected}, got shape {array.shape}")
-        flat = array.reshape(-1)
+        flat = self._actions
+        flat[:] = array[:, 0]
         bad = kernel.first_bad(flat)
         if bad >= 0:
             raise ValueError(f"{expected}; outside [-1, 1] they are clipped; environment {bad} got {flat[bad]!r}")

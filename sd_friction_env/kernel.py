@@ -735,6 +735,32 @@ def _ride(plant, x, v_belt, a_belt, u, t):
     return dx, int_v2, work
 
 
+@compiled
+def _stick_leg(plant, x, v_belt, a_belt, u, duration):
+    """Ride with the belt for ``duration``, or until breakaway.
+
+    Return the time spent, the event, x, the integrals of v^2 and of the contact force's power, and the least and
+    greatest x met.
+    """
+    dt, event = stick_until_event(plant, x, v_belt, a_belt, u, duration)
+    dx, int_v2, int_fv = _ride(plant, x, v_belt, a_belt, u, dt)
+    x_end = x + dx
+    x_min = min(x, x_end)
+    x_max = max(x, x_end)
+    if v_belt * (v_belt + a_belt * dt) < 0.0:  # the belt reverses
+        x_turn = x - 0.5 * v_belt * v_belt / a_belt
+        x_min = min(x_min, x_turn)
+        x_max = max(x_max, x_turn)
+    return dt, event, x_end, int_v2, int_fv, x_min, x_max
+
+
+@compiled
+def _breakaway_mode(plant, x, v_belt, a_belt, u):
+    """Return the mode in which a mass leaves stick: slip the way the load pulls."""
+    load, _ = stick_load(plant, x, v_belt, a_belt, u)
+    return SLIP_BACKWARD if load > 0.0 else SLIP_FORWARD
+
+
 # The automaton ------------------------------------------------------------------------------------------------------
 
 
@@ -768,35 +794,24 @@ def _advance(plant, x, v, v_belt, a_belt, u, duration, events, known):
     while t < duration:
         remaining = duration - t
         if mode == STICK:
-            dt, event = stick_until_event(plant, x, belt, a_belt, u, remaining)
-            dx, dv2, dfv = _ride(plant, x, belt, a_belt, u, dt)
-            int_fv += dfv
-            int_v2 += dv2
+            dt, event, x, dv2, dfv, low, high = _stick_leg(plant, x, belt, a_belt, u, remaining)
             stick_time += dt
-            if belt * (belt + a_belt * dt) < 0.0:  # the belt reverses
-                x_turn = x - 0.5 * belt * belt / a_belt
-                x_min = min(x_min, x_turn)
-                x_max = max(x_max, x_turn)
-            x = x + dx
-            x_min = min(x_min, x)
-            x_max = max(x_max, x)
         else:
             dt, x, v, event, dv2, dfv, low, high = slip_until_event(
                 plant, mode, x, v, belt, a_belt, u, remaining, False, known
             )
             known = NOTHING_KNOWN
-            int_v2 += dv2
-            int_fv += dfv
-            x_min = min(x_min, low)
-            x_max = max(x_max, high)
+        int_v2 += dv2
+        int_fv += dfv
+        x_min = min(x_min, low)
+        x_max = max(x_max, high)
         t = duration if event == NO_EVENT else t + dt
         belt = v_belt + a_belt * t
         kind = event
         if mode == STICK:
             v = belt
             if event == BREAKAWAY:
-                load, _ = stick_load(plant, x, belt, a_belt, u)
-                mode = SLIP_BACKWARD if load > 0.0 else SLIP_FORWARD
+                mode = _breakaway_mode(plant, x, belt, a_belt, u)
         elif event == LANDING:
             v = belt
             landed = mode_at_zero_v_rel(plant, x, belt, a_belt, u)
@@ -1297,13 +1312,15 @@ _X_END, _V_END, _BELT_END, _MODE, _EVENTS, _STATUS = 13, 14, 15, 16, 17, 18
 _INT_V2, _STICK_TIME, _INT_FV, _X_MIN, _X_MAX, _NORMAL = 19, 20, 21, 22, 23, 24
 _DONE_FAST = 25  # 1 where the fast path gave the answer
 _A, _A_END, _ERROR = 26, 27, 28
-_WORK_ROWS = 41
+_WORK_ROWS = 45
 WORK_SIZE = 2 * _WORK_ROWS * STRIDE  # a block's, and one for those of its environments that must be brought together
 # Rows of the second one while the places of events are looked at.
 _L_TIME, _L_SIDE, _L_LEVEL, _L_RATE, _L_MODE, _L_LANE = 13, 14, 15, 16, 17, 18
 _LOOK = 19  # and the eight after it
 _L_LANDS, _L_A = 29, 30
-_F_DONE, _F_X_TURN, _F_X_END, _F_INT_V2, _F_STICK_TIME, _F_INT_FV, _F_X_MIN, _F_X_MAX, _F_NORMAL = range(31, 40)
+_F_WAY, _F_X_EVENT, _F_X_END, _F_INT_V2, _F_STICK_TIME, _F_INT_FV, _F_X_MIN, _F_X_MAX, _F_NORMAL = range(31, 40)
+_F_TIME, _F_V2_THERE, _F_FV_THERE, _F_V_END, _F_EVENTS = range(40, 45)
+_OPEN, _FINISHED, _LANDED = 0.0, 1.0, 2.0  # what _F_WAY says
 
 # Rows of the environments' state, floats ...
 (
@@ -1545,8 +1562,12 @@ def _look_lane(geometry, w, i, interval):
     straight = straight & _stays_open(side * v, side * w[_L_A * STRIDE + i], side * belt_event, side * a_t, event_time)
     rest = interval - event_time
     holds, x_end, stick_v2, stick_fv = _rides(geometry, plant, x_event, belt_event, a_belt, u, rest)
-    w[_F_DONE * STRIDE + i] = 1.0 if done & ((straight & holds & (rest > 0.0)) | (not lands)) else 0.0
-    w[_F_X_TURN * STRIDE + i] = x_event
+    done = done & ((straight & (rest > 0.0)) | (not lands))
+    w[_F_WAY * STRIDE + i] = (_FINISHED if holds | (not lands) else _LANDED) if done else _OPEN
+    w[_F_TIME * STRIDE + i] = event_time
+    w[_F_V2_THERE * STRIDE + i] = dv2
+    w[_F_FV_THERE * STRIDE + i] = dfv
+    w[_F_X_EVENT * STRIDE + i] = x_event
     w[_F_X_END * STRIDE + i] = x_end
     w[_F_INT_V2 * STRIDE + i] = dv2 + stick_v2
     w[_F_STICK_TIME * STRIDE + i] = 0.0 + rest
@@ -1559,26 +1580,142 @@ def _look_lane(geometry, w, i, interval):
 
 
 @in_lanes
+def _onward_lane(geometry, w, i):
+    """Slip one lane, which has just left the stick surface, over the rest of its interval in one step."""
+    plant = _lane_plant(geometry, w, i)
+    x = w[_X * STRIDE + i]
+    v = w[_V * STRIDE + i]
+    a_belt = w[_A_BELT * STRIDE + i]
+    mode = w[_L_MODE * STRIDE + i]
+    rest = w[_L_TIME * STRIDE + i]
+    x_end, v_end, a, a_end, error, int_v2, int_fv = _slip_step_in_lanes(
+        plant, mode, x, v, v, a_belt * rest, w[_U * STRIDE + i], rest
+    )
+    gap_end = mode * (v_end - (v + a_belt * rest))
+    normal = spring(plant, x_end)[1]
+    side = 1.0 if v > 0.0 else -1.0
+    done = (error <= TOLERANCE * rest) & (gap_end > 2.0 * V_REL_ZERO) & (v * v_end > 0.0) & (normal > 0.0)
+    done = done & _stays_open(0.0, mode * (a - a_belt), gap_end, mode * (a_end - a_belt), rest)
+    done = done & _stays_open(side * v, side * a, side * v_end, side * a_end, rest)
+    low = w[_F_X_MIN * STRIDE + i]
+    high = w[_F_X_MAX * STRIDE + i]
+    w[_F_WAY * STRIDE + i] = _FINISHED if done else _OPEN
+    w[_F_X_END * STRIDE + i] = x_end
+    w[_F_V_END * STRIDE + i] = v_end
+    w[_F_INT_V2 * STRIDE + i] = w[_F_V2_THERE * STRIDE + i] + (0.0 + int_v2)
+    w[_F_INT_FV * STRIDE + i] = w[_F_FV_THERE * STRIDE + i] + (0.0 + int_fv)
+    w[_F_X_MIN * STRIDE + i] = x_end if x_end < low else low
+    w[_F_X_MAX * STRIDE + i] = x_end if x_end > high else high
+    w[_F_NORMAL * STRIDE + i] = normal
+
+
+@in_lanes
 def _finished(w, i, sub, n):
     """Whether lane n of the second work space finished lane i's step; if so, take what came out."""
-    if sub[_F_DONE * STRIDE + n] == 0.0:
+    if sub[_F_WAY * STRIDE + n] != _FINISHED:
         return False
     if sub[_L_LANDS * STRIDE + n] == 0.0:
-        x_turn = sub[_F_X_TURN * STRIDE + n]
+        x_turn = sub[_F_X_EVENT * STRIDE + n]
         w[_X_MIN * STRIDE + i] = min(w[_X_MIN * STRIDE + i], x_turn)
         w[_X_MAX * STRIDE + i] = max(w[_X_MAX * STRIDE + i], x_turn)
         return True
-    w[_X_END * STRIDE + i] = sub[_F_X_END * STRIDE + n]
+    _take(w, i, sub, n)
     w[_V_END * STRIDE + i] = w[_BELT_END * STRIDE + i]
     w[_MODE * STRIDE + i] = STICK
     w[_EVENTS * STRIDE + i] = 1.0
+    return True
+
+
+@in_lanes
+def _take(w, i, sub, n):
+    """Take for lane i what lane n of the second work space came to."""
+    w[_X_END * STRIDE + i] = sub[_F_X_END * STRIDE + n]
     w[_INT_V2 * STRIDE + i] = sub[_F_INT_V2 * STRIDE + n]
     w[_STICK_TIME * STRIDE + i] = sub[_F_STICK_TIME * STRIDE + n]
     w[_INT_FV * STRIDE + i] = sub[_F_INT_FV * STRIDE + n]
     w[_X_MIN * STRIDE + i] = sub[_F_X_MIN * STRIDE + n]
     w[_X_MAX * STRIDE + i] = sub[_F_X_MAX * STRIDE + n]
     w[_NORMAL * STRIDE + i] = sub[_F_NORMAL * STRIDE + n]
+
+
+@compiled
+def _send_onward(w, i, sub, n, one_plant, interval, t, x, mode, n_events, stick_time, int_v2, int_fv, x_min, x_max):
+    """Tell lane n of the second work space how lane i goes on slipping, from x at time t, and what it has gathered."""
+    belt = w[_BELT * STRIDE + i] + w[_A_BELT * STRIDE + i] * t
+    _bring(w, i, sub, n, one_plant)
+    sub[_X * STRIDE + n] = x
+    sub[_V * STRIDE + n] = belt
+    sub[_L_TIME * STRIDE + n] = interval - t
+    sub[_L_MODE * STRIDE + n] = mode
+    sub[_L_LANE * STRIDE + n] = i
+    sub[_F_EVENTS * STRIDE + n] = n_events
+    sub[_F_STICK_TIME * STRIDE + n] = stick_time
+    sub[_F_V2_THERE * STRIDE + n] = 0.0 + int_v2
+    sub[_F_FV_THERE * STRIDE + n] = 0.0 + int_fv
+    sub[_F_X_MIN * STRIDE + n] = x_min
+    sub[_F_X_MAX * STRIDE + n] = x_max
+
+
+@compiled
+def _crosses(geometry, w, i, sub, j, n, one_plant, interval):
+    """Whether lane i, whose landing was looked at in lane j of the second work space, goes on slipping from there; if
+    so, make it lane n (not above j)."""
+    if sub[_F_WAY * STRIDE + j] != _LANDED:
+        return False
+    x = w[_X * STRIDE + i]
+    x_event = sub[_F_X_EVENT * STRIDE + j]
+    t = sub[_F_TIME * STRIDE + j]
+    a_belt = w[_A_BELT * STRIDE + i]
+    belt = w[_BELT * STRIDE + i] + a_belt * t
+    mode = mode_at_zero_v_rel(_lane_plant(geometry, w, i), x_event, belt, a_belt, w[_U * STRIDE + i])
+    if mode == STICK:
+        return False
+    int_v2 = sub[_F_V2_THERE * STRIDE + j]
+    int_fv = sub[_F_FV_THERE * STRIDE + j]
+    low = min(x, x_event)
+    high = max(x, x_event)
+    _send_onward(w, i, sub, n, one_plant, interval, t, x_event, mode, 1, 0.0, int_v2, int_fv, low, high)
     return True
+
+
+@compiled
+def _breaks_away(geometry, w, i, sub, n, one_plant, interval):
+    """Whether lane i, which moves with the belt, goes on slipping; if so, make it lane n of the second work space.
+
+    If it sticks to the end, its step is finished here. Nothing is done where contact is lost at once or nothing of the
+    interval is left.
+    """
+    plant = _lane_plant(geometry, w, i)
+    x = w[_X * STRIDE + i]
+    belt = w[_BELT * STRIDE + i]
+    a_belt = w[_A_BELT * STRIDE + i]
+    u = w[_U * STRIDE + i]
+    if spring(plant, x)[1] <= 0.0:
+        return False
+    mode = mode_at_zero_v_rel(plant, x, belt, a_belt, u)
+    if mode != STICK:
+        _send_onward(w, i, sub, n, one_plant, interval, 0.0, x, mode, 0, 0.0, 0.0, 0.0, x, x)
+        return True
+    t, event, x_event, int_v2, int_fv, low, high = _stick_leg(plant, x, belt, a_belt, u, interval)
+    if event == BREAKAWAY:
+        if t >= interval:
+            return False
+        mode = _breakaway_mode(plant, x_event, belt + a_belt * t, a_belt, u)
+        _send_onward(w, i, sub, n, one_plant, interval, t, x_event, mode, 1, t, int_v2, int_fv, low, high)
+        return True
+    w[_X_END * STRIDE + i] = x_event
+    w[_V_END * STRIDE + i] = w[_BELT_END * STRIDE + i]
+    w[_MODE * STRIDE + i] = STICK
+    w[_EVENTS * STRIDE + i] = 0.0
+    w[_STATUS * STRIDE + i] = OK
+    w[_INT_V2 * STRIDE + i] = 0.0 + int_v2
+    w[_STICK_TIME * STRIDE + i] = interval
+    w[_INT_FV * STRIDE + i] = 0.0 + int_fv
+    w[_X_MIN * STRIDE + i] = low
+    w[_X_MAX * STRIDE + i] = high
+    w[_NORMAL * STRIDE + i] = spring(plant, x_event)[1]
+    w[_DONE_FAST * STRIDE + i] = 1.0
+    return False
 
 
 @compiled
@@ -2187,12 +2324,15 @@ def _stepper(geometry):
                         n += 1
             failures = 0
             n = 0
+            leaving = 0
             for i in range(m):
                 if not one_plant and geometries[i] != geometry:
                     failures += _lane_by_events(geometries[i], w, i, interval, NOTHING_KNOWN)
                 elif w[_DONE_FAST * STRIDE + i] == 0.0:
-                    if not fast or w[_V * STRIDE + i] == w[_BELT * STRIDE + i]:
+                    if not fast:
                         failures += _lane_by_events(geometry, w, i, interval, NOTHING_KNOWN)
+                    elif w[_V * STRIDE + i] == w[_BELT * STRIDE + i]:
+                        leaving += 1
                     elif _wants_look(w, i, sub, n, interval, one_plant):
                         n += 1
                     else:
@@ -2201,10 +2341,36 @@ def _stepper(geometry):
                 # Events in the midst of a slip step are looked at side by side as well.
                 for i in range(_whole(n)):
                     _look_lane(geometry, sub, i, interval)
-                for j in range(n):
+            onward = 0
+            for j in range(n):
+                i = int(sub[_L_LANE * STRIDE + j])
+                if _finished(w, i, sub, j):
+                    continue
+                if _crosses(geometry, w, i, sub, j, onward, one_plant, interval):
+                    onward += 1
+                else:
+                    failures += _lane_after_trial(geometry, w, i, sub, j, interval, 2.0)
+            if leaving > 0:
+                for i in range(m):
+                    if w[_DONE_FAST * STRIDE + i] == 0.0 and w[_V * STRIDE + i] == w[_BELT * STRIDE + i]:
+                        if _breaks_away(geometry, w, i, sub, onward, one_plant, interval):
+                            onward += 1
+                        elif w[_DONE_FAST * STRIDE + i] == 0.0:
+                            failures += _lane_by_events(geometry, w, i, interval, NOTHING_KNOWN)
+            if onward > 0:
+                # What has left the stick surface slips over the rest of the interval side by side.
+                for i in range(_whole(onward)):
+                    _onward_lane(geometry, sub, i)
+                for j in range(onward):
                     i = int(sub[_L_LANE * STRIDE + j])
-                    if not _finished(w, i, sub, j):
-                        failures += _lane_after_trial(geometry, w, i, sub, j, interval, 2.0)
+                    if sub[_F_WAY * STRIDE + j] == _FINISHED:
+                        _take(w, i, sub, j)
+                        w[_V_END * STRIDE + i] = sub[_F_V_END * STRIDE + j]
+                        w[_MODE * STRIDE + i] = sub[_L_MODE * STRIDE + j]
+                        w[_EVENTS * STRIDE + i] = sub[_F_EVENTS * STRIDE + j]
+                        w[_STATUS * STRIDE + i] = OK
+                    else:
+                        failures += _lane_by_events(geometry, w, i, interval, NOTHING_KNOWN)
             ended += _account(
                 task, codes, state, integers, work, wanted, rewards, over, report, report_codes, first, m, failures
             )

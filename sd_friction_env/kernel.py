@@ -1294,9 +1294,10 @@ def random_normal(key, episode, step, slot):
 # A batch of environments --------------------------------------------------------------------------------------------
 #
 # Environments are stepped in blocks of LANES. In a block every environment takes one slip step over the whole interval
-# in vector instructions, whether it slips or not; those that stick are stepped side by side too; what met an event, a
-# turning point or a step that must be refined goes through control_interval, one by one. A lane is left on its fast
-# path only where control_interval would have done the very same arithmetic, so that both give the same bits.
+# in vector instructions, whether it slips or not; those that stick are stepped side by side too, and so are those that
+# turn, those that land, and those that leave the stick surface and slip on. What is more involved (two events, a step
+# that must be refined) goes the way of control_interval, one by one. A lane is left on a fast path only where
+# control_interval would have done the very same arithmetic, so that both give the same bits.
 #
 # A block works in one flat array whose rows are STRIDE apart. With such constant distances the compiler sees that rows
 # do not overlap, which is what lets it use vector instructions.

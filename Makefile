@@ -10,8 +10,10 @@ TORCH_INDEX ?=
 
 ifeq ($(OS),Windows_NT)
 RUN := $(VENV)/Scripts/python
+PEERS_RUN := .venv-peers/Scripts/python
 else
 RUN := $(VENV)/bin/python
+PEERS_RUN := .venv-peers/bin/python
 endif
 STAMP := $(VENV)/.installed
 # Goes in first and alone: TORCH_INDEX holds PyTorch, not our versions of what it needs.
@@ -21,12 +23,12 @@ PIP := -m pip --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint format slow reference benchmark figures constraints clean
+.PHONY: help setup demo test lint format slow reference benchmark benchmark-peers figures constraints clean
 
 help: ## list the targets
 	@echo "Usage: make TARGET [ARGS=...] [PYTHON=python3.12] [TORCH_INDEX=https://download.pytorch.org/whl/cpu]"
 	@echo
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  \1\t\2/p' Makefile | expand -t 16
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  \1\t\2/p' Makefile | expand -t 20
 
 setup: $(STAMP) ## make .venv and install the project into it, with pinned versions
 
@@ -72,8 +74,13 @@ slow: setup ## run the tests that take minutes
 reference: setup ## print the numbers that the project promises, beside what it reaches
 	"$(RUN)" scripts/reference_numbers.py $(ARGS)
 
-benchmark: setup ## measure the speed, ours and others', in one run
+benchmark: setup ## measure the speed, ours and others', in one run (minutes)
 	"$(RUN)" scripts/benchmark.py $(ARGS)
+
+# Apart from .venv, for what they need and what we need may not go together.
+benchmark-peers: ## make .venv-peers with EnvPool and gymnax: `make benchmark` then measures them too
+	"$(PYTHON)" -m venv .venv-peers
+	"$(PEERS_RUN)" $(PIP) install -r benchmark_peers.txt
 
 figures: setup ## compute and draw the paper's figures again
 	for name in 2 3 4 5 basins linear; do "$(RUN)" scripts/figure_$$name.py || exit 1; done
@@ -88,7 +95,7 @@ constraints: ## renew constraints.txt from the newest versions (then run make te
 	mv constraints.new constraints.txt
 	rm -rf .venv-newest
 
-clean: ## remove .venv, caches, builds and the demo's output (trained runs stay)
-	rm -rf "$(VENV)" .venv-newest build dist demo_output *.egg-info .mypy_cache .pytest_cache .ruff_cache
+clean: ## remove .venv and its like, caches, builds and the demo's output (trained runs stay)
+	rm -rf "$(VENV)" .venv-newest .venv-peers build dist demo_output *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	rm -rf .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

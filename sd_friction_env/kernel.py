@@ -1002,21 +1002,35 @@ def next_maximum(plant, v_belt, x):
     """Return map of slip: from a maximum of x (v = 0) to the next one, without a stick between.
 
     Return the event that ended it (TURNING if a maximum was reached), the next maximum, the minimum between, the
-    time taken and the integral of v^2. A first arc that rises (x is no maximum) is not followed: the event is NO_EVENT.
+    time taken, the integral of v^2 and the number of forward arcs. A first arc that rises (x is no maximum) is not
+    followed: the event is NO_EVENT.
     """
     mode = mode_of(plant, x, 0.0, v_belt, 0.0, 0.0)
     acceleration, _ = slip_forces(plant, mode, x, 0.0, v_belt, 0.0)
     if mode != SLIP_BACKWARD or acceleration >= 0.0:
-        return NO_EVENT, math.nan, math.nan, math.nan, math.nan
-    t, x_low, v, event, int_v2, _, _, _ = slip_until_event(
-        plant, mode, x, 0.0, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
-    )
-    if event != TURNING:
-        return event, math.nan, x_low, t, int_v2
-    dt, x_high, v, event, dv2, _, _, _ = slip_until_event(
-        plant, mode, x_low, 0.0, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
-    )
-    return event, x_high, x_low, t + dt, int_v2 + dv2
+        return NO_EVENT, math.nan, math.nan, math.nan, math.nan, 0
+    v = 0.0
+    t = 0.0
+    int_v2 = 0.0
+    x_low = math.nan
+    forward_arcs = 0
+    for _ in range(MAX_EVENTS):
+        dt, x, v, event, dv2, _, _, _ = slip_until_event(
+            plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
+        )
+        t += dt
+        int_v2 += dv2
+        if event == LANDING:
+            mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
+            if mode == STICK:
+                return event, math.nan, x_low, t, int_v2, forward_arcs
+            if mode == SLIP_FORWARD:
+                forward_arcs += 1
+        elif event == TURNING and slip_forces(plant, mode, x, 0.0, v_belt, 0.0)[0] >= 0.0:
+            x_low = x
+        else:
+            return event, x if event == TURNING else math.nan, x_low, t, int_v2, forward_arcs
+    return NO_EVENT, math.nan, x_low, t, int_v2, forward_arcs
 
 
 @compiled

@@ -226,7 +226,7 @@ def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | Non
             if abs(place - previous) < _SMALLEST_RADIUS:
                 return _steady(parameters, "steady-slip", place, x, v)
             continue
-        verdict, place = _limit_of_slip(parameters, previous, place > previous, around)
+        verdict, place = _limit_of_slip(parameters, previous, around)
         if verdict == "pure-slip":
             return _pure_slip(parameters, place, x, v)
         if verdict == "steady-slip":
@@ -242,6 +242,14 @@ def root(function: Callable[[float], float], low: float, high: float) -> float:
     return float(brentq(function, low, high, xtol=1e-15, rtol=1e-14))
 
 
+class _NoLapError(Exception):
+    """An orbit of this radius has no lap; the return map is not defined there."""
+
+    def __init__(self, radius: float) -> None:
+        super().__init__(radius)
+        self.radius = radius
+
+
 class ReturnMap:
     """The map from one maximum of x to the next in slip, by the radius: the distance of the maximum from a centre.
 
@@ -254,7 +262,7 @@ class ReturnMap:
 
     def shift(self, radius: float) -> float:
         """Return how much one lap adds to a radius; NaN if the lap sticks or does not circle just these equilibria."""
-        event, following, low, _, _ = kernel.next_maximum(self.plant, self.speed, self.centre + radius)
+        event, following, low = kernel.next_maximum(self.plant, self.speed, self.centre + radius)[:3]
         if event != kernel.TURNING or not low <= self.innermost:
             return math.nan
         return float(following - self.centre - radius)
@@ -271,8 +279,28 @@ class ReturnMap:
                 inside = middle
 
     def root(self, low: float, high: float) -> float:
-        """Return the radius of the cycle between two radii whose shifts differ in sign."""
-        return root(self.shift, low, high)
+        """Return the radius of the cycle between two radii whose shifts differ in sign.
+
+        Raises:
+            _NoLapError: if a radius between, met on the way, has no lap.
+        """
+
+        def shift(radius: float) -> float:
+            change = self.shift(radius)
+            if math.isnan(change):
+                raise _NoLapError(radius)
+            return change
+
+        return root(shift, low, high)
+
+    def roots(self, low: float, high: float) -> list[float]:
+        """Return the radii of cycles between two radii that have laps: none where their shifts have the same sign."""
+        if self.shift(low) * self.shift(high) >= 0.0:
+            return []
+        try:
+            return [self.root(low, high)]
+        except _NoLapError as gap:
+            return self.roots(low, self.edge(low, gap.radius)) + self.roots(self.edge(high, gap.radius), high)
 
     def cycles(self) -> tuple[list[float], float]:
         """Return the radii of all cycles, ascending, and the largest radius with a lap.
@@ -294,37 +322,44 @@ class ReturnMap:
             samples.append((last, self.shift(last)))
         from scipy.optimize import minimize_scalar
 
-        radii = [self.root(r0, r1) for (r0, s0), (r1, s1) in itertools.pairwise(samples) if s0 * s1 < 0.0]
+        radii = [radius for (r0, _), (r1, _) in itertools.pairwise(samples) for radius in self.roots(r0, r1)]
         for (r0, s0), (_, s1), (r2, s2) in zip(samples, samples[1:], samples[2:], strict=False):
             if s0 * s1 > 0.0 and s1 * s2 > 0.0 and abs(s1) < min(abs(s0), abs(s2)):
                 side = math.copysign(1.0, s1)
                 nearest = minimize_scalar(lambda r, side=side: side * self.shift(r), bounds=(r0, r2), method="bounded")
                 if nearest.fun < 0.0:
-                    radii += [self.root(r0, nearest.x), self.root(nearest.x, r2)]
+                    radii += self.roots(r0, nearest.x) + self.roots(nearest.x, r2)
         return sorted(radii), samples[-1][0]
 
 
-def _limit_of_slip(
-    parameters: OscillatorParameters, maximum: float, growing: bool, around: list[Equilibrium]
-) -> tuple[str, float]:
+def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: list[Equilibrium]) -> tuple[str, float]:
     """Return where successive maxima of x tend from ``maximum``, which has a next one: ("pure-slip", fixed point),
     ("steady-slip", x) or ("on", the first maximum on the way from which the motion sticks or circles other equilibria).
     """
     laps = ReturnMap(parameters, around[0].x, around[-1].x)
     centre = laps.centre
     radius = maximum - centre
+    shift = laps.shift(radius)
+    if math.isnan(shift):
+        return "on", maximum
+    growing = shift > 0.0
     factor = 1.2 if growing else 0.5
     while _SMALLEST_RADIUS < radius < 2.0 * STATE_LIMIT:
-        following = factor * radius
-        change = laps.shift(following)
-        if math.isnan(change):
-            # Up to the last orbit with a lap there can still be a cycle; if there is none, the motion passes it.
-            following = laps.edge(radius, following)
+        following, last = factor * radius, False
+        while True:
             change = laps.shift(following)
+            if math.isnan(change):
+                # Up to the last orbit with a lap there can still be a cycle; if there is none, the motion passes it.
+                following, last = laps.edge(radius, following), True
+                change = laps.shift(following)
             if (change > 0.0) == growing:
-                return "on", centre + following * (1.0 + (1e-12 if growing else -1e-12))
-        if (change > 0.0) != growing:
-            return "pure-slip", centre + laps.root(radius, following)
+                break
+            try:
+                return "pure-slip", centre + laps.root(radius, following)
+            except _NoLapError as gap:
+                following = gap.radius
+        if last:
+            return "on", centre + following * (1.0 + (1e-12 if growing else -1e-12))
         radius = following
     return ("on", centre + radius) if growing else ("steady-slip", centre)
 
@@ -422,7 +457,11 @@ def _stick_slip(parameters: OscillatorParameters, x_exit: float, x: float, v: fl
 
 def _pure_slip(parameters: OscillatorParameters, x_max: float, x: float, v: float) -> LimitCycle:
     plant, speed = parameters.plant, parameters.belt_speed
-    _, _, x_min, period, int_v2 = kernel.next_maximum(plant, speed, x_max)
+    event, _, x_min, period, int_v2, forward_arcs = kernel.next_maximum(plant, speed, x_max)
+    if event != kernel.TURNING:
+        raise OrbitError(f"the cycle of slip through x = {x_max!r} does not close; {parameters}")
+    if x_max - x_min < _SMALLEST_RADIUS:
+        return _steady(parameters, "steady-slip", x_max, x, v)
     step = 1e-4 * (x_max - x_min)
     above = kernel.next_maximum(plant, speed, x_max + step)[1]
     below = kernel.next_maximum(plant, speed, x_max - step)[1]
@@ -444,7 +483,7 @@ def _pure_slip(parameters: OscillatorParameters, x_max: float, x: float, v: floa
         x_breakaway=math.nan,
         x_restick=math.nan,
         sticks=0,
-        forward_arcs=0,
+        forward_arcs=forward_arcs,
         floquet_multiplier=multiplier,
         x_start=x,
         v_start=v,

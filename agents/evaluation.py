@@ -6,7 +6,7 @@ the belt's speed), never from samples at their ends.
 
 import functools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sd_friction_env import SDFrictionEnv, Table
+from sd_friction_env import SDFrictionEnv, SDFrictionVectorEnv, Table
 from sd_friction_env.policies import Policy, State, ZeroPolicy
 
 Array = NDArray[np.float64]
@@ -28,6 +28,7 @@ SUPPRESSED_BELT_SPEED = 0.02  # deviation of the mean from nominal, relative
 SMALLEST_PASSIVE_AMPLITUDE = 1e-3  # where passive motion dies out by itself, amplitudes are compared with this
 
 _REWARD_TERMS = ("vibration", "effort", "stick", "contact_loss")
+_RECORDED = (*(f"reward_{name}" for name in _REWARD_TERMS), "x_min", "x_max", "stick_fraction", "action")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +58,6 @@ class Episodes:
     completed: NDArray[np.bool_]
 
 
-EnvFactory = Callable[[], gym.Env[Any, Any]]
-
-
 def make_env(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> SDFrictionEnv:
     """Return a bare environment (no wrappers: they cost more than the step itself)."""
     env = gym.make(env_id, **dict(env_kwargs or {})).unwrapped
@@ -70,7 +68,7 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> SDFric
 
 def run_episodes(
     policy: Policy,
-    env: str | EnvFactory,
+    env_id: str,
     seeds: Sequence[int] = EVALUATION_SEEDS,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> Episodes:
@@ -78,9 +76,7 @@ def run_episodes(
 
     Args:
         policy: acts on the batch of all observations.
-        env: id, or a function that returns an :class:`SDFrictionEnv` (wrapped or not).
-        seeds: at least one, each at least 0.
-        env_kwargs: of the environment, with an id.
+        env_id: of one of our environments. seeds: at least one, each at least 0. env_kwargs: of the environment.
 
     Raises:
         TypeError, ValueError: if there is no seed, one is no such number, or the policy does not fit the environment.
@@ -88,21 +84,17 @@ def run_episodes(
     seeds = [int(seed) for seed in seeds]
     if not seeds or min(seeds) < 0:
         raise ValueError(f"seeds must be one or more whole numbers >= 0, got {seeds!r}")
-    if isinstance(env, str):
-        envs = [make_env(env, env_kwargs) for _ in seeds]
-    else:
-        envs = []
-        for _ in seeds:
-            bare = env().unwrapped
-            if not isinstance(bare, SDFrictionEnv):
-                raise TypeError(f"env must make an SDFrictionEnv, got {bare!r}")
-            envs.append(bare)
-    n, steps = len(envs), envs[0].task.episode_steps
-    observations = np.stack([bare.reset(seed=seed)[0] for bare, seed in zip(envs, seeds, strict=True)])
-    belt_speed = np.array([bare.parameters.belt_speed for bare in envs])
-    record = np.full((steps, 10, n), np.nan)
+    make_env(env_id, env_kwargs)  # refuses what is not ours
+    n = len(seeds)
+    made = gym.make_vec(env_id, n, info_keys=(*_RECORDED, "v_belt"), **dict(env_kwargs or {}))
+    envs = made.unwrapped
+    assert isinstance(envs, SDFrictionVectorEnv)
+    steps = envs.task.episode_steps
+    observations, _ = envs.reset(seed=seeds)
+    belt_speed = np.array([parameters.belt_speed for parameters in envs.get_attr("parameters")])
+    record = np.full((steps, 2 + len(_RECORDED), n), np.nan)
     v_belt = belt_speed.copy()
-    running = list(range(n))
+    running = np.ones(n, dtype=bool)
     completed = np.zeros(n, dtype=bool)
     state: State = None
     starts = np.ones(n, dtype=bool)
@@ -112,42 +104,27 @@ def run_episodes(
         if actions.shape != (n, 1):
             raise ValueError(f"the policy returned actions of shape {actions.shape}, not ({n}, 1)")
         starts = np.zeros(n, dtype=bool)
-        # Fresh observations, for a policy may keep those it was given.
-        observations = observations.copy()
-        ended = []
-        for i in running:
-            observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
-            v_belt_end = info["v_belt"]
-            record[t, :, i] = (
-                reward,
-                info["reward_vibration"],
-                info["reward_effort"],
-                info["reward_stick"],
-                info["reward_contact_loss"],
-                info["x_min"],
-                info["x_max"],
-                info["stick_fraction"],
-                0.5 * (v_belt[i] + v_belt_end),  # exact: the belt accelerates evenly over an interval
-                info["action"],
-            )
-            v_belt[i] = v_belt_end
-            if terminated or truncated:
-                completed[i] = t + 1 == steps and not terminated
-                ended.append(i)
-        if ended:
-            running = [i for i in running if i not in ended]
+        observations, rewards, terminated, truncated, info = envs.step(actions)
+        values = np.stack([rewards, *(info[name] for name in _RECORDED), 0.5 * (v_belt + info["v_belt"])])
+        record[t] = np.where(running, values, np.nan)  # the belt accelerates evenly: the mean of its ends is exact
+        v_belt = info["v_belt"]
+        completed |= running & truncated & ~terminated
+        running &= ~(terminated | truncated)
+        if not running.any():
+            break
+    envs.close()
     columns = record.transpose(1, 2, 0)
     return Episodes(
         seeds=np.array(seeds),
-        control_interval=envs[0].task.control_interval,
+        control_interval=envs.task.control_interval,
         belt_speed=belt_speed,
         reward=columns[0],
         reward_terms=columns[1:5],
         x_min=columns[5],
         x_max=columns[6],
         stick_fraction=columns[7],
-        mean_belt_speed=columns[8],
-        action=columns[9],
+        action=columns[8],
+        mean_belt_speed=columns[9],
         completed=completed,
     )
 
@@ -230,7 +207,7 @@ def metrics(episodes: Episodes, passive: Episodes) -> Table:
 
 def evaluate(
     policy: Policy,
-    env: str | EnvFactory,
+    env_id: str,
     seeds: Sequence[int] = EVALUATION_SEEDS,
     env_kwargs: Mapping[str, Any] | None = None,
     *,
@@ -239,25 +216,23 @@ def evaluate(
     """Run one episode per seed and return the table of :func:`metrics`.
 
     Args:
-        policy, env, seeds, env_kwargs: as :func:`run_episodes` takes them.
-        passive: the same episodes without control, if they are at hand (else they are run too, and kept for an id).
+        policy, env_id, seeds, env_kwargs: as :func:`run_episodes` takes them.
+        passive: the same episodes without control, if they are at hand (else they are run too, and kept).
     """
     if passive is None:
-        passive = passive_episodes(env, seeds, env_kwargs)
-    return metrics(run_episodes(policy, env, seeds, env_kwargs), passive)
+        passive = passive_episodes(env_id, seeds, env_kwargs)
+    return metrics(run_episodes(policy, env_id, seeds, env_kwargs), passive)
 
 
 def passive_episodes(
-    env: str | EnvFactory, seeds: Sequence[int] = EVALUATION_SEEDS, env_kwargs: Mapping[str, Any] | None = None
+    env_id: str, seeds: Sequence[int] = EVALUATION_SEEDS, env_kwargs: Mapping[str, Any] | None = None
 ) -> Episodes:
     """Return the episodes of :func:`run_episodes` without control."""
-    if not isinstance(env, str):
-        return run_episodes(ZeroPolicy(), env, seeds)
     try:
         key = json.dumps(dict(env_kwargs or {}), sort_keys=True)
     except TypeError:  # arguments that are no plain data, such as a reward function
-        return run_episodes(ZeroPolicy(), env, seeds, env_kwargs)
-    return _passive_episodes(env, tuple(seeds), key)
+        return run_episodes(ZeroPolicy(), env_id, seeds, env_kwargs)
+    return _passive_episodes(env_id, tuple(seeds), key)
 
 
 @functools.lru_cache(maxsize=8)

@@ -2,6 +2,8 @@
 
 import collections
 import dataclasses
+import math
+import numbers
 from collections.abc import Callable, Mapping
 from typing import Any, Self, SupportsFloat
 
@@ -355,7 +357,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             reward = float(self.reward(info))
             self._state[kernel.S_RETURN] += reward
         if self.render_mode is not None:
-            self._mode = info["mode"]
+            self.note_mode(info["mode"])
             self.note_for_picture(info["x_min"], info["x_max"], info["stick_fraction"], info["force"])
             if self.render_mode == "human":
                 self.render()
@@ -381,10 +383,9 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         The episode's statistics begin anew.
 
         Raises:
-            TypeError: if it is not an :class:`EnvState`.
+            TypeError, ValueError: if it is not an :class:`EnvState` whose values are as :meth:`get_state` returns them.
         """
-        if not isinstance(state, EnvState):
-            raise TypeError(f"state must be an EnvState as get_state() returns it, got {state!r}")
+        checked_state("state", state)
         self._use(state.parameters)
         write_state(state, self._state, self._integers, self._past, 0)
         self._key = state.key
@@ -395,6 +396,10 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Remember what an interval came to for the readouts of :meth:`render`."""
         self._window.append((x_min, x_max, stick_fraction))
         self._force = force
+
+    def note_mode(self, mode: int) -> None:
+        """Remember the mode that a step told, for :meth:`render`: a state alone does not know the drive."""
+        self._mode = mode
 
     def clear_picture(self) -> None:
         """Begin the readouts and the trail of :meth:`render` anew."""
@@ -514,9 +519,47 @@ def write_state(saved: EnvState, state: FloatArray, integers: IntegerArray, past
     integers[kernel.I_STEPS, i] = integers[kernel.I_FIRST_STEP, i] = saved.steps
     integers[kernel.I_OVER, i] = kernel.ENDED if saved.ended else kernel.RUNNING
     if len(past):
-        integers[kernel.I_SEEN, i] = len(saved.past)
+        integers[kernel.I_SEEN, i] = min(len(saved.past), len(past))  # a longer memory's oldest are left out
         for k, pair in enumerate(saved.past[-len(past) :]):
             past[k, :, i] = pair
+
+
+def checked_state(name: str, state: Any) -> None:
+    """Refuse what :func:`read_state` cannot have returned.
+
+    Raises:
+        TypeError: if ``state`` is no :class:`EnvState`, or one of its values is not of its kind.
+        ValueError: if one of its values is not finite (unless it has ended) or negative where it counts.
+    """
+    if not isinstance(state, EnvState):
+        raise TypeError(f"{name} must be an EnvState as get_state() returns it, got {state!r}")
+    if not isinstance(state.parameters, OscillatorParameters):
+        raise TypeError(f"{name}.parameters must be OscillatorParameters, got {state.parameters!r}")
+    check_belt(state.parameters)
+    if not isinstance(state.ended, bool | np.bool_):
+        raise TypeError(f"{name}.ended must be True or False, got {state.ended!r}")
+    for field in ("x", "v", "v_belt", "belt_travel", "worst_cost"):
+        value = getattr(state, field)
+        if type(value) is float and math.isfinite(value):  # as a rule, and the quickest to ask
+            continue
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            raise TypeError(f"{name}.{field} must be a real number, got {value!r}")
+        if not (math.isfinite(value) or state.ended):
+            raise ValueError(f"{name}.{field} must be finite, got {value!r}")
+    for field in ("steps", "key", "episode"):
+        value = getattr(state, field)
+        if isinstance(value, bool) or not isinstance(value, int | np.integer):
+            raise TypeError(f"{name}.{field} must be a whole number, got {value!r}")
+        if not 0 <= value < 2**63:
+            raise ValueError(f"{name}.{field} must be in [0, 2**63), got {value!r}")
+    if state.past == ():
+        return
+    try:
+        shape = np.asarray(state.past, np.float64).shape
+    except (TypeError, ValueError):
+        shape = ()
+    if len(shape) != 2 or shape[1] != 2:
+        raise TypeError(f"{name}.past must be a tuple of pairs (x, v) of numbers, got {state.past!r}")
 
 
 def as_parameters(parameters: Any) -> OscillatorParameters:
@@ -525,8 +568,15 @@ def as_parameters(parameters: Any) -> OscillatorParameters:
     if isinstance(parameters, OscillatorParameters):
         return parameters
     if isinstance(parameters, Mapping):
+        _check_names("parameters", parameters)
         return OscillatorParameters().replace(**parameters)
     raise TypeError(f"parameters must be OscillatorParameters or a mapping of its fields, got {parameters!r}")
+
+
+def _check_names(name: str, parameters: Mapping[Any, Any]) -> None:
+    for key in parameters:
+        if not isinstance(key, str):
+            raise TypeError(f"{name} must map parameter names to values, got the name {key!r}")
 
 
 def check_belt(parameters: OscillatorParameters) -> None:
@@ -553,15 +603,31 @@ def start_of(
 def _clipped_action(action: Any) -> float:
     """Return a finite action clipped to [-1, 1], whatever kind of array or sequence of one number it came in."""
     expected = "action must be one finite number in an array of shape (1,)"
-    try:
-        array = np.asarray(action, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise TypeError(f"{expected}, got {action!r}") from None
+    array = real_array(expected, action)
     if array.shape != (1,):
         raise ValueError(f"{expected}, got shape {array.shape}: {action!r}")
     if not np.isfinite(array[0]):
         raise ValueError(f"{expected}; outside [-1, 1] it is clipped; got {action!r}")
     return float(min(max(array[0], -1.0), 1.0))
+
+
+def real_array(expected: str, values: Any) -> NDArray[Any]:
+    """Return real numbers as an array, float32 or float64.
+
+    Raises:
+        TypeError: if they are no real numbers (text, complex numbers and times are none), or no array can be made of
+            them; its message begins with what is ``expected``.
+    """
+    try:
+        array = np.asarray(values)
+    except (RuntimeError, TypeError, ValueError) as error:  # RuntimeError: of a tensor that requires a gradient
+        raise TypeError(f"{expected}, got {values!r} ({error})") from None
+    if array.dtype in (np.float32, np.float64):
+        return array
+    objects = array.dtype == object and all(isinstance(value, numbers.Real) for value in array.flat)
+    if array.dtype.kind not in "biuf" and not objects:
+        raise TypeError(f"{expected}, got {values!r} of type {array.dtype}")
+    return array.astype(np.float64)
 
 
 def checked_options(options: Any) -> dict[str, Any]:
@@ -579,6 +645,8 @@ def checked_options(options: Any) -> dict[str, Any]:
             checked["parameters"] = dataclasses.asdict(given)
         elif not isinstance(given, Mapping):
             raise TypeError(f"options['parameters'] must map parameter names to values, got {given!r}")
+        else:
+            _check_names("options['parameters']", given)
     for name in ("x", "v"):
         if name in checked:
             checked[name] = checked_number(f"options[{name!r}]", checked[name], -STATE_LIMIT, STATE_LIMIT)

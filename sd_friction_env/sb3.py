@@ -1,7 +1,7 @@
 """The batch of environments as Stable-Baselines3 takes it. Importing this module imports Stable-Baselines3."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from sd_friction_env.vector_env import RESET_KEYS, SDFrictionVectorEnv
+from sd_friction_env.vector_env import RESET_KEYS, SDFrictionVectorEnv, checked_info_keys
 
 _ENTRY_POINT = f"{SDFrictionVectorEnv.__module__}:{SDFrictionVectorEnv.__name__}"
 
@@ -48,7 +48,7 @@ class SDFrictionVecEnv(VecEnv):
         env_id: str,
         num_envs: int = 1,
         *,
-        info_keys: Sequence[str] | Literal["all"] = (),
+        info_keys: Collection[str] | Literal["all"] = (),
         stagger: bool = False,
         **kwargs: Any,
     ) -> None:
@@ -57,8 +57,11 @@ class SDFrictionVecEnv(VecEnv):
                 raise TypeError(f"{name} is not free here: Stable-Baselines3 needs its own")
         if not isinstance(stagger, bool):
             raise TypeError(f"stagger must be True or False, got {stagger!r}")
-        if info_keys:
-            kwargs["info_keys"] = info_keys
+        keys = checked_info_keys(info_keys)
+        if keys:
+            kwargs["info_keys"] = keys
+        if not isinstance(env_id, str):
+            raise TypeError(f"env_id must name an environment of this package, got {env_id!r}")
         name = env_id.rpartition(":")[2]
         if name not in gym.registry or gym.registry[name].vector_entry_point != _ENTRY_POINT:
             raise ValueError(f"env_id must name an environment of this package, got {env_id!r}")
@@ -67,10 +70,10 @@ class SDFrictionVecEnv(VecEnv):
         self.envs = envs
         self.stagger = stagger
         self.batch_info: dict[str, Any] = {}
-        self._info_keys = tuple(name for name in envs.step_keys if info_keys == "all" or name in info_keys)
-        self._actions: NDArray[np.float32] = np.zeros((num_envs, 1), np.float32)
+        self._info_keys = tuple(name for name in envs.step_keys if name in keys)
+        self._actions: NDArray[np.float32] = np.zeros((envs.num_envs, 1), np.float32)
         self._began = time.monotonic()
-        super().__init__(num_envs, envs.single_observation_space, envs.single_action_space)
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> NDArray[np.float32]:
         """Start episodes with the seeds and options set before; return the observations (num_envs, size), float32."""
@@ -96,7 +99,8 @@ class SDFrictionVecEnv(VecEnv):
         dones = terminated | truncated
         infos: list[dict[str, Any]]
         if self._info_keys and not dones.all():
-            infos = _rows(info, self._info_keys, self.num_envs)
+            told = [name for name in self._info_keys if name in info]  # fewer if all have only been reset
+            infos = _rows(info, told, self.num_envs)
             for i, single in enumerate(infos):
                 single["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
         else:
@@ -131,8 +135,16 @@ class SDFrictionVecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Return an attribute of environments; see :meth:`SDFrictionVectorEnv.call`."""
-        return self.envs.call_at(self._get_indices(indices), attr_name)
+        """Return an attribute of environments; see :meth:`SDFrictionVectorEnv.attributes_at`."""
+        return self.envs.attributes_at(self._get_indices(indices), attr_name)
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether the environments, which are all of one kind, have an attribute of that name."""
+        try:
+            self.envs.attributes_at([0], attr_name)
+        except AttributeError:
+            return False
+        return True
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Set an attribute of environments; see :meth:`SDFrictionVectorEnv.set_attr`."""

@@ -1,7 +1,9 @@
 """Many friction oscillators at once as a Gymnasium vector environment, stepped without Python in between."""
 
+import copy as copying
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+import inspect
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
@@ -19,8 +21,10 @@ from sd_friction_env.env import (
     SDFrictionEnv,
     check_belt,
     checked_options,
+    checked_state,
     named_statistics,
     read_state,
+    real_array,
     start_of,
     task_arrays,
     write_state,
@@ -71,6 +75,7 @@ _STATE_ROWS = {
     "mu_s": kernel.S_MU_S,
     "belt_speed": kernel.S_BELT_SPEED,
 }
+_STATE_METHODS = ("reset", "set_state", "step")  # of the single environment
 
 
 class _Buffers(NamedTuple):
@@ -80,6 +85,16 @@ class _Buffers(NamedTuple):
     over: NDArray[np.bool_]
     report: FloatArray
     codes: IntegerArray
+
+
+class _Starts(NamedTuple):
+    """Episodes of environments that are ready to begin; nothing of the batch has been changed yet."""
+
+    which: IntegerArray
+    numbers: FloatArray  # rows: _NUMBERS, columns as in which
+    state: FloatArray  # columns of the kernel's arrays
+    integers: IntegerArray
+    own: NDArray[np.bool_]  # who has other parameters than the nominal ones
 
 
 class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
@@ -146,7 +161,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         render_mode: str | None = None,
         render_envs: Iterable[int] | None = None,
         reward: RewardFunction | None = None,
-        info_keys: Sequence[str] | Literal["all"] = REWARD_TERMS,
+        info_keys: Collection[str] | Literal["all"] = REWARD_TERMS,
         **task_arguments: Any,
     ) -> None:
         super().__init__()
@@ -163,7 +178,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             raise TypeError(f"copy must be True or False, got {copy!r}")
         self.copy = copy
         self._single = SDFrictionEnv(parameters, render_mode=render_mode, reward=reward, **task_arguments)
-        self.info_keys = _checked_info_keys(info_keys)
+        self.info_keys = checked_info_keys(info_keys)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.nominal = self._single.nominal
@@ -187,12 +202,10 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self._shown = np.zeros((n, len(task.randomise) if task.show_parameters else 0))
         shares = max(1, min(self.threads, n // _ENVS_WORTH_A_THREAD))
         self._works = np.ones((shares, kernel.WORK_SIZE))
-        self._task_codes[kernel.T_TRAVEL] = render_mode is not None
+        self._task_codes[kernel.T_TRAVEL] = True
         self._own = np.zeros(n, np.bool_)  # who has other parameters than the nominal ones
         # Whether compiled code alone can begin the next episode of one with the nominal parameters.
         self._restarts_alike = task.start != "random" and not task.randomise
-        self._stepper = (kernel.STEPPERS if shares == 1 else kernel.STEPPERS_IN_THREADS)[self._geometry]
-        self._is_warm = False
         # Every share but the last is made of whole blocks.
         blocks = -(-n // kernel.LANES)
         self._bounds = np.minimum(kernel.LANES * (np.arange(shares + 1) * blocks // shares), n)
@@ -201,17 +214,12 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         assert shape is not None
         self._observations = np.zeros((n, *shape), np.float32)
         self._actions = np.zeros(n)
-        self._kept: _Buffers | None = None
+        self._expected_actions = f"actions must be finite numbers in an array of shape ({n}, 1)"
         self._no_codes = np.empty((0, self._width), np.int64)
         self._everyone = np.arange(n)
-        # What holds for all is one array for all steps, and cannot be written to.
-        self._all = np.ones(n, np.bool_)
-        self._all_ok = np.full(n, kernel.STATUS_NAMES[kernel.OK], object)
-        for shared in (self._all, self._all_ok):
-            shared.setflags(write=False)
         # What is reported: all that the info holds, a reward function reads or a picture shows.
         self.step_keys = tuple(name for name in _STEP_KEYS if name in self.info_keys)
-        pictured = ("x_min", "x_max", "stick_fraction", "force") if render_mode is not None else ()
+        pictured = ("x_min", "x_max", "stick_fraction", "force", "mode") if render_mode is not None else ()
         needed = set(_STEP_KEYS if reward is not None else (*self.step_keys, *pictured))
         self._reported = tuple(name for name in _REPORT if name in needed)
         self._wanted = np.array([_REPORT[name] for name in self._reported], np.int64)
@@ -219,12 +227,34 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self._status_wanted = "status" in needed
         told = {*self._reported, *(_CODES if self._codes_wanted else ()), *(needed & {"status"})}
         self._unasked = tuple(told - set(self.step_keys))
-        self._masks = {f"_{name}": self._all for name in self.step_keys}
-        self._over = np.zeros(0, np.int64)  # whose episodes ended with the last step
+        self._over = np.zeros(0, np.int64)  # whose episodes have ended: they wait for a reset
         self._seeds: list[int | None] = [None] * n
         self._is_reset = False
         self._attributes: dict[str, list[Any]] = {}
         self._views = _views(self._single, render_envs, n, render_mode)
+        self._single.render_mode = None  # it takes the place of many and draws none
+        self._modes: dict[int, int] = {}  # that the last step told of the environments that are drawn
+        self._make_what_does_not_travel()
+
+    def _make_what_does_not_travel(self) -> None:
+        """Make what a copy has to make anew: compiled code, and arrays that cannot be written to."""
+        self._stepper = (kernel.STEPPERS if len(self._works) == 1 else kernel.STEPPERS_IN_THREADS)[self._geometry]
+        self._is_warm = False
+        self._kept: _Buffers | None = None
+        # What holds for all is one array for all steps.
+        self._all = np.ones(self.num_envs, np.bool_)
+        self._all_ok = np.full(self.num_envs, kernel.STATUS_NAMES[kernel.OK], object)
+        for shared in (self._all, self._all_ok):
+            shared.setflags(write=False)
+        self._masks = {f"_{name}": self._all for name in self.step_keys}
+
+    def __getstate__(self) -> dict[str, Any]:
+        anew = ("_stepper", "_is_warm", "_kept", "_all", "_all_ok", "_masks")
+        return {name: value for name, value in vars(self).items() if name not in anew}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._make_what_does_not_travel()
 
     # Starting ---------------------------------------------------------------------------------------------------------
 
@@ -240,8 +270,10 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             Observations (num_envs, size), float32, and info.
 
         Raises:
-            TypeError, ValueError: if an option or a seed is not as said; all running episodes are then untouched.
+            TypeError, ValueError: if an option or a seed is not as said.
             gymnasium.error.ResetNeeded: if some are to go on that were never reset.
+
+        A reset that fails changes nothing.
         """
         n = self.num_envs
         seeds = _checked_seeds(seed, n)
@@ -251,20 +283,23 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             raise gym.error.ResetNeeded("reset all environments once before resetting some: the others have no state")
         keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which] + 1
         new_seeds = list(self._seeds)
+        stream = None if self._is_reset else copying.deepcopy(self.np_random)
         for place, i in enumerate(which.tolist()):
             if seeds[i] is not None:
                 new_seeds[i] = seeds[i]
                 keys[place], episodes[place] = seeding.np_random(seeds[i])[0].integers(2**62), 0
-            elif not self._is_reset:
-                keys[place], episodes[place] = self.np_random.integers(2**62), 0
+            elif stream is not None:
+                keys[place], episodes[place] = stream.integers(2**62), 0
         parameters, geometries = self._drawn(keys, episodes)
-        x, v, placed = self._given(which, keys, episodes, per_env, parameters, geometries)
+        given = self._given(which, keys, episodes, per_env, parameters, geometries)
+        starts = self._prepared(which, keys, episodes, parameters, geometries, *given)
         # Nothing can go wrong from here on, and only now is anything changed.
-        self._integers[kernel.I_KEY, which] = keys
-        self._integers[kernel.I_EPISODE, which] = episodes
+        if stream is not None:
+            self.np_random.bit_generator.state = stream.bit_generator.state
         self._seeds = new_seeds
         self._is_reset = True
-        self._begin(which, parameters, geometries, x, v, placed)
+        self._begin(starts)
+        self._observe(which)
         self._over = self._over[~np.isin(self._over, which)]
         info = self._reset_info(which, self._at_start(which))
         return self._observations.copy() if self.copy else self._observations, info
@@ -305,66 +340,78 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         values = dict(zip(_NUMBERS, numbers.tolist(), strict=True))
         return self.nominal.replace(geometry=GEOMETRIES[geometry], **values)
 
-    def _begin(
+    def _prepared(
         self,
         which: IntegerArray,
+        keys: IntegerArray,
+        episodes: IntegerArray,
         parameters: FloatArray,
         geometries: IntegerArray,
-        x: FloatArray | None = None,
-        v: FloatArray | None = None,
-        placed: NDArray[np.bool_] | None = None,
-    ) -> None:
-        """Start episodes with these parameters, at the states (x, v) where ``placed``; observe them."""
-        state, integers = self._state, self._integers
-        self._numbers[:, which] = parameters
+        x: FloatArray,
+        v: FloatArray,
+        placed: NDArray[np.bool_],
+    ) -> _Starts:
+        """Return episodes with these parameters, at the states (x, v) where ``placed``, else where the task says.
+
+        All that can fail when an episode begins fails here, before the batch is changed.
+        """
+        state = np.zeros((kernel.STATE_ROWS, len(which)))
+        integers = np.zeros((kernel.INTEGER_ROWS, len(which)), np.int64)
         for name, row in _STATE_ROWS.items():
-            state[row, which] = parameters[_NUMBERS.index(name)]
+            state[row] = parameters[_NUMBERS.index(name)]
         mu_s, mu_m, v_m = (parameters[_NUMBERS.index(name)] for name in ("mu_s", "mu_m", "v_m"))
-        state[kernel.S_K1, which], state[kernel.S_K3, which] = stribeck_coefficients(mu_s, mu_m, v_m)
-        integers[kernel.I_GEOMETRY, which] = geometries
-        kernel.blank_episodes(state, integers, which)
-        self._own[which] = (geometries != self._geometry) | (parameters != self._nominal_numbers).any(axis=0)
+        state[kernel.S_K1], state[kernel.S_K3] = stribeck_coefficients(mu_s, mu_m, v_m)
+        state[kernel.S_X], state[kernel.S_V] = x, v
+        integers[kernel.I_KEY], integers[kernel.I_EPISODE] = keys, episodes
+        integers[kernel.I_GEOMETRY] = geometries
+        kernel.blank_episodes(state, integers, np.arange(len(which)))
+        own = (geometries != self._geometry) | (parameters != self._nominal_numbers).any(axis=0)
+        starts = _Starts(which, parameters, state, integers, own)
+        self._place(starts, np.flatnonzero(~placed))
+        return starts
+
+    def _begin(self, starts: _Starts) -> None:
+        """Start episodes; they are not observed yet."""
+        which = starts.which
+        here = slice(self.num_envs) if len(which) == self.num_envs else which  # in one go, where that is possible
+        self._numbers[:, here] = starts.numbers
+        self._state[:, here] = starts.state
+        self._integers[:, here] = starts.integers
+        self._own[here] = starts.own
         one_plant = not self._own.any()
         if one_plant and not self._task_codes[kernel.T_ONE_PLANT]:
             for work in self._works:
-                kernel.fill_plant(work, state[:, which[0]])
+                kernel.fill_plant(work, self._state[:, which[0]])
         self._task_codes[kernel.T_ONE_PLANT] = one_plant
         if self.task.show_parameters:
-            self._shown[which] = self.task.shown_parameters(dict(zip(_NUMBERS, parameters, strict=True))).T
-        if placed is None:
-            self._place(which, parameters)
-        else:
-            assert x is not None
-            assert v is not None
-            state[kernel.S_X, which], state[kernel.S_V, which] = x, v
-            self._place(which[~placed], parameters[:, ~placed])
-        self._observe(which)
+            self._shown[which] = self.task.shown_parameters(dict(zip(_NUMBERS, starts.numbers, strict=True))).T
         self._clear_pictures(which)
 
     def _clear_pictures(self, which: IntegerArray) -> None:
         if self._views:
             for i in self._views.keys() & set(which.tolist()):
                 self._views[i].clear_picture()
+                self._modes.pop(i, None)
 
-    def _place(self, which: IntegerArray, parameters: FloatArray) -> None:
-        """Put environments where the task starts its episodes."""
-        if len(which) == 0:
+    def _place(self, starts: _Starts, columns: IntegerArray) -> None:
+        """Put the episodes in these columns where the task starts them."""
+        if len(columns) == 0:
             return
-        state, task = self._state, self.task
-        keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which]
+        task, state, integers = self.task, starts.state, starts.integers
+        keys, episodes = integers[kernel.I_KEY, columns], integers[kernel.I_EPISODE, columns]
         if task.start == "random":
-            state[kernel.S_X, which], state[kernel.S_V, which] = task.random_states(keys, episodes)
+            state[kernel.S_X, columns], state[kernel.S_V, columns] = task.random_states(keys, episodes)
             return
-        own = self._own[which]
-        left = which[own]
+        own = starts.own[columns]
+        left = columns[own]
         with announced("starts in a batch"):
-            kernel.place_on_cycle(state, self._integers, which[~own], *self._nominal_start)
+            kernel.place_on_cycle(state, integers, columns[~own], *self._nominal_start)
             if task.start == "cycle":
-                left = left[kernel.own_cycle_starts(state, self._integers, left, task.phases(keys, episodes)[own]) == 1]
-        for i in left.tolist():
-            j = int(np.searchsorted(which, i))
-            single = self._as_parameters(parameters[:, j], int(self._integers[kernel.I_GEOMETRY, i]))
-            state[kernel.S_X, i], state[kernel.S_V, i] = task.start_state(single, int(keys[j]), int(episodes[j]))
+                left = left[kernel.own_cycle_starts(state, integers, left, task.phases(keys, episodes)[own]) == 1]
+        for j in left.tolist():
+            single = self._as_parameters(starts.numbers[:, j], int(integers[kernel.I_GEOMETRY, j]))
+            key, episode = integers[[kernel.I_KEY, kernel.I_EPISODE], j].tolist()
+            state[kernel.S_X, j], state[kernel.S_V, j] = task.start_state(single, key, episode)
 
     @functools.cached_property
     def _nominal_start(self) -> tuple[FloatArray, float, int]:
@@ -449,6 +496,9 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             TypeError, ValueError: if the actions are not finite numbers of this shape; nothing has then been stepped.
             gymnasium.error.ResetNeeded: before the first reset; with autoreset_mode "Disabled" also if an
                 environment's episode has ended.
+
+        If an episode cannot be started, nothing has been stepped either; with autoreset_mode "SameStep" all have been,
+        and the environments whose episodes ended wait for a reset.
         """
         if not self._is_reset:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
@@ -459,6 +509,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
                 f"the episodes of environments {_listed(resting)} have ended: reset them with "
                 "options={'reset_mask': ...} before step()"
             )
+        next_starts = self._next_starts(resting) if len(resting) else None
         out = self._buffers()
         ended = self._advance(forces, out)
         terminated, truncated = out.over
@@ -471,7 +522,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         for name in self._unasked:
             del info[name]
         if len(resting):
-            self._restart(resting)
+            self._restart(resting, next_starts)
             out.rewards[resting] = 0.0
             out.over[:, resting] = False
             self._show_restarted(info, resting)
@@ -482,7 +533,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
                 if self.autoreset_mode == AutoresetMode.SAME_STEP:
                     final = self._final(info, over)
                     del info["statistics"], info["_statistics"]
-                    self._restart(over)
+                    self._over = over  # unless they can be restarted
+                    self._restart(over, self._next_starts(over))
                     self._show_restarted(info, over)
                     info.update(final)
                     over = over[:0]
@@ -508,13 +560,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         return said
 
     def _checked_actions(self, actions: Any) -> FloatArray:
-        expected = f"actions must be finite numbers in an array of shape ({self.num_envs}, 1)"
-        try:
-            array = np.asarray(actions)
-            if array.dtype not in (np.float32, np.float64):
-                array = array.astype(np.float64)
-        except (TypeError, ValueError):
-            raise TypeError(f"{expected}, got {actions!r}") from None
+        expected = self._expected_actions
+        array = real_array(expected, actions)
         if array.shape != (self.num_envs, 1):
             raise ValueError(f"{expected}, got shape {array.shape}")
         flat = self._actions
@@ -571,25 +618,35 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
                 rewards[i] = float(self.reward({name: values[i] for name, values in columns.items()}))
         self._state[kernel.S_RETURN, : self.num_envs] += rewards
 
-    def _restart(self, which: IntegerArray) -> None:
-        """Start the next episodes of environments."""
+    def _next_starts(self, which: IntegerArray) -> _Starts | None:
+        """Return the next episodes of environments; None if compiled code alone can begin them."""
         if self._restarts_alike and not self._own[which].any():
-            kernel.restart(
-                self._task_numbers,
-                self._task_codes,
-                self._state,
-                self._integers,
-                self._past,
-                self._shown,
-                self._observations,
-                which,
-                *self._nominal_start,
-            )
-            self._clear_pictures(which)
+            _ = self._nominal_start  # which may fail, and must do so now
+            return None
+        keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which] + 1
+        nowhere = np.zeros(len(which))
+        return self._prepared(
+            which, keys, episodes, *self._drawn(keys, episodes), nowhere, nowhere, np.zeros(len(which), np.bool_)
+        )
+
+    def _restart(self, which: IntegerArray, starts: _Starts | None) -> None:
+        """Begin the next episodes of environments, as :meth:`_next_starts` returned them."""
+        if starts is not None:
+            self._begin(starts)
+            self._observe(which)
             return
-        self._integers[kernel.I_EPISODE, which] += 1
-        keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which]
-        self._begin(which, *self._drawn(keys, episodes))
+        kernel.restart(
+            self._task_numbers,
+            self._task_codes,
+            self._state,
+            self._integers,
+            self._past,
+            self._shown,
+            self._observations,
+            which,
+            *self._nominal_start,
+        )
+        self._clear_pictures(which)
 
     def _show_restarted(self, info: dict[str, Any], which: IntegerArray) -> None:
         """Let info say of environments that they have been reset."""
@@ -682,29 +739,31 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         The episodes' statistics begin anew.
 
         Raises:
-            TypeError, ValueError: if ``states`` are not ``num_envs`` times an :class:`EnvState`.
+            TypeError, ValueError: if ``states`` are not ``num_envs`` times what :meth:`get_states` returns; nothing is
+                then changed.
         """
+        if not isinstance(states, Sequence):
+            raise TypeError(f"states must be a sequence of {self.num_envs}, as get_states() returns it, got {states!r}")
         if len(states) != self.num_envs:
             raise ValueError(f"states must be {self.num_envs}, one per environment, got {len(states)}")
-        for state in states:
-            if not isinstance(state, EnvState):
-                raise TypeError(f"states must be as get_states() returns them, got {state!r}")
         for i, state in enumerate(states):
-            self._set_state(i, state)
-
-    def _set_state(self, i: int, state: EnvState) -> None:
-        own = state.parameters
-        which = np.array([i])
-        observation = self._observations[i].copy()
-        self._integers[kernel.I_KEY, i], self._integers[kernel.I_EPISODE, i] = state.key, state.episode
-        numbers = np.array([[getattr(own, name)] for name in _NUMBERS])
-        here = (np.array([state.x]), np.array([state.v]), np.array([True]))
-        self._begin(which, numbers, np.array([own.plant.geometry]), *here)
-        self._observations[i] = observation
-        write_state(state, self._state, self._integers, self._past, i)
-        if not state.ended:
-            self._over = self._over[self._over != i]
+            checked_state(f"states[{i}]", state)
+        self._put_states(self._everyone, states)
         self._is_reset = True
+
+    def _put_states(self, which: IntegerArray, states: Sequence[EnvState]) -> None:
+        """Put (checked) states into environments."""
+        numbers = np.array([[getattr(saved.parameters, name) for saved in states] for name in _NUMBERS])
+        geometries = np.array([saved.parameters.plant.geometry for saved in states])
+        keys = np.array([saved.key for saved in states])
+        episodes = np.array([saved.episode for saved in states])
+        elsewhere = np.zeros(len(which))  # write_state puts them in their places
+        everywhere = np.ones(len(which), np.bool_)
+        self._begin(self._prepared(which, keys, episodes, numbers, geometries, elsewhere, elsewhere, everywhere))
+        for i, saved in zip(which.tolist(), states, strict=True):
+            write_state(saved, self._state, self._integers, self._past, i)
+        over = np.array([saved.ended or saved.steps >= self.task.episode_steps for saved in states])
+        self._over = np.union1d(self._over[~np.isin(self._over, which)], which[over])
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of every environment, or read an attribute; return the results.
@@ -713,27 +772,54 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
 
         Raises:
             AttributeError: if an environment has nothing of that name.
+            gymnasium.error.ResetNeeded: before the first reset, if the call needs or makes a state.
+            ValueError: if it is to draw an environment that ``render_envs`` does not name.
         """
         return tuple(self.call_at(range(self.num_envs), name, *args, **kwargs))
 
     def call_at(self, indices: Iterable[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
         """:meth:`call` for some of the environments."""
+        return [self._call_one(name, i, *args, **kwargs) for i in indices]
+
+    def _call_one(self, name: str, i: int, /, *args: Any, **kwargs: Any) -> Any:
+        if name == "render":
+            return self._drawn_one(i)
+        found = self._attribute(name, i)
+        if not callable(found):
+            return found
+        if name in _STATE_METHODS and not self._is_reset:
+            raise gym.error.ResetNeeded(
+                f"call reset() before call({name!r}): there is no state yet that it could change"
+            )
+        result = found(*args, **kwargs)
+        if name in _STATE_METHODS:
+            self._put_states(np.array([i]), [self._single.get_state()])
+        if name == "reset" and kwargs.get("seed") is not None:
+            self._seeds[i] = kwargs["seed"]
+        return result
+
+    def _attribute(self, name: str, i: int) -> Any:
+        """Return an attribute of an environment; a method is that of the single environment put in its place."""
         if name in self._attributes:
-            return [self._attributes[name][i] for i in indices]
-        single = self._single
-        results = []
+            return self._attributes[name][i]
+        if name in ("render_mode", "np_random_seed"):
+            return self.render_mode if name == "render_mode" else self._seeds[i]
+        if self._is_reset:
+            self._single.set_state(self._state_of(i))
+        return getattr(self._single, name)
+
+    def attributes_at(self, indices: Iterable[int], name: str) -> list[Any]:
+        """Return an attribute of some of the environments; nothing is called: a method is one that acts on its own.
+
+        Raises:
+            AttributeError: if an environment has nothing of that name.
+        """
+        found = []
         for i in indices:
-            before = None
-            if self._is_reset:
-                before = self._state_of(i)
-                single.set_state(before)
-            result = getattr(single, name)
-            results.append(result(*args, **kwargs) if callable(result) else result)
-            if before is not None:
-                after = single.get_state()
-                if after != before:
-                    self._set_state(i, after)
-        return results
+            value = self._attribute(name, i)
+            own = inspect.ismethod(value) and value.__self__ is self._single
+            found.append(functools.partial(self._call_one, name, i) if own else value)
+        return found
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Return an attribute of every environment."""
@@ -770,18 +856,28 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             if i not in resting:
                 seen = (float(said["x_min"][i]), float(said["x_max"][i]), float(said["stick_fraction"][i]))
                 view.note_for_picture(*seen, float(said["force"][i]))
+                self._modes[i] = int(said["mode"][i])
 
     def render(self) -> tuple[Any, ...] | None:
         """Draw the environments ``render_envs``; a tuple of arrays (height, width, 3), uint8, in mode "rgb_array"."""
         if self.render_mode is None:
-            gym.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array' or 'human'")
+            self._single.render()  # which warns
             return None
-        frames = []
-        for i, view in self._views.items():
-            if self._is_reset:
-                view.set_state(self._state_of(i))
-            frames.append(view.render())
-        return tuple(frames) if self.render_mode == "rgb_array" else None
+        frames = tuple(self._drawn_one(i) for i in self._views)
+        return frames if self.render_mode == "rgb_array" else None
+
+    def _drawn_one(self, i: int) -> Any:
+        """Draw an environment; see :meth:`SDFrictionEnv.render`."""
+        if self.render_mode is None:
+            return self._single.render()
+        if i not in self._views:
+            raise ValueError(f"environment {i} is not drawn: render_envs names those that are, {sorted(self._views)!r}")
+        view = self._views[i]
+        if self._is_reset:
+            view.set_state(self._state_of(i))
+            if i in self._modes:
+                view.note_mode(self._modes[i])
+        return view.render()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the windows, if there are any."""
@@ -794,6 +890,10 @@ def _views(
     single: SDFrictionEnv, render_envs: Iterable[int] | None, num_envs: int, render_mode: str | None
 ) -> dict[int, SDFrictionEnv]:
     """Return the single environments that draw, by the place they draw."""
+    if render_envs is not None and not isinstance(render_envs, Iterable):
+        raise TypeError(
+            f"render_envs must be None or a sequence of whole numbers in [0, {num_envs - 1}], got {render_envs!r}"
+        )
     if render_envs is None:
         chosen = list(range(min(num_envs, _MOST_RENDERED if render_mode == "rgb_array" else 1)))
     else:
@@ -805,14 +905,24 @@ def _views(
     return {i: single.twin() for i in chosen}
 
 
-def _checked_info_keys(info_keys: Any) -> frozenset[str]:
+def checked_info_keys(info_keys: Any) -> frozenset[str]:
+    """Return the names that a step's info is to hold.
+
+    Raises:
+        TypeError, ValueError: if ``info_keys`` is neither "all" nor a sequence or a set of names of ``INFO_KEYS``.
+    """
+    expected = "info_keys must be 'all' or a sequence of names"
     if isinstance(info_keys, str):
         if info_keys == "all":
             return frozenset(INFO_KEYS)
-        raise ValueError(f"info_keys must be 'all' or a sequence of names, got {info_keys!r}")
+        raise ValueError(f"{expected}, got {info_keys!r}")
+    if not isinstance(info_keys, Collection) or (isinstance(info_keys, np.ndarray) and info_keys.ndim != 1):
+        raise TypeError(f"{expected}, got {info_keys!r}")
     for name in info_keys:
+        if not isinstance(name, str):
+            raise TypeError(f"{expected}, got {name!r} among them")
         checked_choice("info_keys", name, INFO_KEYS)
-    return frozenset(info_keys)
+    return frozenset(map(str, info_keys))
 
 
 def _whole(name: str, value: Any, low: int, high: int) -> int:
@@ -834,7 +944,8 @@ def _checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
     """
     if seed is None:
         return [None] * num_envs
-    if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
+    listed = isinstance(seed, Sequence) and not isinstance(seed, str | bytes | bytearray | memoryview)
+    if listed or (isinstance(seed, np.ndarray) and seed.ndim > 0):
         if len(seed) != num_envs:
             raise ValueError(f"seed must hold {num_envs} seeds, one per environment, got {len(seed)}")
         return [None if single is None else _checked_seed(single) for single in seed]
@@ -850,13 +961,20 @@ def _checked_seed(seed: Any) -> int:
     return int(seed)
 
 
-def _entry(name: str, value: Any, i: int, num_envs: int) -> Any:
-    """Return what a value says of environment i: its entry if it is an array, or else the value."""
-    if isinstance(value, np.ndarray | list | tuple):
-        if len(value) != num_envs or np.ndim(value) != 1:
-            raise ValueError(f"{name} must be one value or {num_envs}, got shape {np.shape(value)}")
-        value = value[i]
-    return value.item() if isinstance(value, np.generic) else value
+def _entries(name: str, value: Any, num_envs: int) -> list[Any]:
+    """Return what a value says of every environment: the entries of an array, or else the value for all."""
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
+    if not isinstance(value, np.ndarray | list | tuple):
+        return [value.item() if isinstance(value, np.generic) else value] * num_envs
+    if isinstance(value, np.ndarray) and value.ndim > 1:
+        raise ValueError(f"{name} must be one value or {num_envs}, got shape {value.shape}")
+    if len(value) != num_envs:
+        raise ValueError(f"{name} must be one value or {num_envs}, got {len(value)}")
+    for entry in value:
+        if isinstance(entry, list | tuple) or (isinstance(entry, np.ndarray) and entry.ndim > 0):
+            raise ValueError(f"{name} must be one value or {num_envs}, got {entry!r} among them")
+    return [entry.item() if isinstance(entry, np.generic | np.ndarray) else entry for entry in value]
 
 
 def _checked_batch_options(options: Any, num_envs: int) -> tuple[NDArray[np.bool_] | None, list[dict[str, Any]] | None]:
@@ -886,13 +1004,10 @@ def _checked_batch_options(options: Any, num_envs: int) -> tuple[NDArray[np.bool
     parameters = given.get("parameters")
     if isinstance(parameters, Sequence) and not isinstance(parameters, str) and len(parameters) != num_envs:
         raise ValueError(f"options['parameters'] must be a mapping or {num_envs} of them, got {len(parameters)}")
-    per_env = []
-    for i in range(num_envs):
-        single = {name: _entry(f"options[{name!r}]", value, i, num_envs) for name, value in given.items()}
-        if isinstance(single.get("parameters"), Mapping):
-            single["parameters"] = {
-                name: _entry(f"options['parameters'][{name!r}]", value, i, num_envs)
-                for name, value in single["parameters"].items()
-            }
-        per_env.append(checked_options(single))
-    return mask, per_env
+    columns = {name: _entries(f"options[{name!r}]", value, num_envs) for name, value in given.items()}
+    if isinstance(parameters, Mapping):
+        named = {
+            name: _entries(f"options['parameters'][{name!r}]", value, num_envs) for name, value in parameters.items()
+        }
+        columns["parameters"] = [{name: entries[i] for name, entries in named.items()} for i in range(num_envs)]
+    return mask, [checked_options({name: entries[i] for name, entries in columns.items()}) for i in range(num_envs)]

@@ -112,6 +112,23 @@ def test_going_back_to_a_state_repeats_the_future_bit_for_bit(env_id):
     assert same(first, [fresh.step(a) for a in actions], exact=True)
 
 
+@pytest.mark.parametrize(("saved_with", "loaded_with"), [(4, 1), (4, 2), (1, 4), (3, 0), (0, 3)])
+def test_a_state_goes_into_a_sensor_of_another_delay(saved_with, loaded_with):
+    env, other = (make("SDFriction/ForceSensed-v0", sensor_delay=delay) for delay in (saved_with, loaded_with))
+    roll(env, 3, 7)
+    state = env.get_state()
+    other.set_state(state)
+    kept = loaded_with + 1 if loaded_with else 0
+    assert other.get_state().past == state.past[len(state.past) - min(kept, len(state.past)) :]
+    # what is seen next is what was sensed so many intervals before, as far as it is remembered
+    seen = other.step(np.zeros(1, np.float32))[0][0]
+    reference = make("SDFriction/ForceSensed-v0", sensor_delay=0)
+    roll(reference, 3, 7)
+    now = reference.step(np.zeros(1, np.float32))[0][0]
+    remembered = [(x - env.task.x_offset) / env.task.x_scale for x, _ in state.past[-loaded_with:]] if kept else []
+    assert seen == pytest.approx(remembered[0] if remembered else now, abs=1e-6)
+
+
 def test_the_reward_is_the_sum_of_its_reported_terms_and_each_is_as_documented():
     env = make(w_effort=0.3, w_stick=0.7)
     env.reset(seed=0, options={"x": 0.5, "v": 0.2})
@@ -332,7 +349,7 @@ def test_an_action_outside_the_box_is_clipped_and_no_number_is_refused():
     for bad in ([math.nan], [math.inf], np.zeros(2), np.zeros((1, 1)), 0.5):
         with pytest.raises(ValueError, match="action must be one finite number"):
             env.step(bad)
-    for bad in (["push"], None, object()):
+    for bad in (["push"], None, object(), ["1"], np.zeros(1, complex), np.zeros(1, "m8[s]")):
         with pytest.raises((TypeError, ValueError), match="action must be one finite number"):
             env.step(bad)
     assert env.get_state() == before
@@ -378,6 +395,7 @@ def test_a_bad_option_is_refused_and_the_episode_goes_on(options, message):
         ({"randomise": {"mu_m": (0.1, 0.3)}}, ValueError, "mu_m must not exceed"),
         ({"parameters": {"belt_speed": 0}}, ValueError, "belt_speed must be positive"),
         ({"parameters": 3}, TypeError, "parameters must be"),
+        ({"parameters": {3: 1}}, TypeError, "parameters must map parameter names to values, got the name 3"),
         ({"reward": 3}, TypeError, "reward must be a function"),
         ({"show_parameters": "yes"}, TypeError, "show_parameters must be"),
     ],

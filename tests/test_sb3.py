@@ -1,5 +1,7 @@
 """The batch as Stable-Baselines3 takes it, beside its own DummyVecEnv."""
 
+import copy
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -126,6 +128,62 @@ def test_states_are_taken_and_given_back():
     assert all(same(a[0], b[0]) and same(a[1], b[1]) for a, b in zip(first, second, strict=True))
 
 
+def test_attributes_are_looked_up_and_methods_not_called():
+    envs = SDFrictionVecEnv(FORCE, 3)
+    envs.seed(2)
+    envs.reset()
+    before = envs.env_method("get_state")
+    assert all(envs.has_attr(name) for name in ("reset", "step", "get_state", "parameters", "render_mode"))
+    ask = envs.get_attr("get_state")
+    assert [method() for method in ask] == before
+    envs.get_attr("reset", [1])[0](seed=9)
+    after = envs.env_method("get_state")
+    assert [a == b for a, b in zip(after, before, strict=True)] == [True, False, True]
+    envs.set_attr("notify", print)
+    assert envs.get_attr("notify") == [print] * 3
+
+
+def test_a_copy_steps_on_with_the_same_bits():
+    envs = SDFrictionVecEnv(FORCE, 3, episode_steps=10)
+    envs.reset()
+    envs.step(np.zeros((3, 1), np.float32))
+    twin = copy.deepcopy(envs)
+    for _ in range(20):
+        ours, theirs = twin.step(np.ones((3, 1), np.float32)), envs.step(np.ones((3, 1), np.float32))
+        assert all(map(same, ours[:3], theirs[:3]))
+
+
+def test_an_action_that_wants_a_gradient_is_refused_with_the_way_out():
+    import torch
+
+    envs = SDFrictionVecEnv(FORCE, 3)
+    envs.reset()
+    with pytest.raises(TypeError, match=r"(?s)actions must be finite numbers .* tensor.detach\(\)"):
+        envs.step(torch.zeros(3, 1, requires_grad=True))
+    assert envs.step(torch.zeros(3, 1))[0].shape == (3, 2)
+
+
+def test_names_and_numbers_are_taken_in_every_form_that_the_batch_takes():
+    envs = SDFrictionVecEnv(FORCE, 2.0, info_keys=np.array(["x", "v"]))
+    assert envs.num_envs == 2
+    envs.reset()
+    assert {"x", "v"} <= set(envs.step(np.zeros((2, 1), np.float32))[3][0])
+
+
+def test_states_at_an_episodes_end_are_followed_by_a_reset():
+    single = gym.make(FORCE, episode_steps=5).unwrapped
+    single.reset(seed=0)
+    for _ in range(5):
+        single.step(np.zeros(1))
+    envs = SDFrictionVecEnv(FORCE, 2, episode_steps=5, info_keys="all")
+    envs.reset()
+    envs.env_method("set_state", single.get_state())
+    _, rewards, dones, _ = envs.step(np.ones((2, 1), np.float32))
+    assert (rewards.tolist(), dones.tolist()) == ([0.0, 0.0], [False, False])
+    assert [state.steps for state in envs.env_method("get_state")] == [0, 0]
+    assert envs.step(np.ones((2, 1), np.float32))[3][0]["time"] == pytest.approx(0.1)
+
+
 def test_staggered_episodes_end_one_after_another():
     envs = SDFrictionVecEnv(FORCE, 5, episode_steps=50, stagger=True)
     envs.reset()
@@ -154,6 +212,10 @@ def test_pictures_are_tiled():
         ({"stagger": 1}, "stagger must be"),
         ({"num_envs": 0}, r"num_envs must be .* in \[1, "),
         ({"info_keys": ["nonsense"]}, "info_keys must be one of"),
+        ({"info_keys": None}, "info_keys must be 'all' or a sequence of names, got None"),
+        ({"info_keys": (name for name in ["x"])}, "info_keys must be 'all' or"),
+        ({"env_id": 3}, "env_id must name an environment of this package, got 3"),
+        ({"num_envs": 2.5}, "num_envs must be a whole number"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):

@@ -1,5 +1,8 @@
 """The batch is the single environment, many times: bit for bit."""
 
+import copy
+import dataclasses
+import pickle
 import tracemalloc
 
 import gymnasium as gym
@@ -7,7 +10,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from sd_friction_env import ENVIRONMENT_IDS, OscillatorParameters, SDFrictionVectorEnv, limit_cycle
+from sd_friction_env import ENVIRONMENT_IDS, OscillatorParameters, SDFrictionVectorEnv, kernel, limit_cycle
+from sd_friction_env.orbits import OrbitError
+from sd_friction_env.task import Task
 
 MODES = [mode.value for mode in AutoresetMode]
 
@@ -286,16 +291,16 @@ def test_batch_and_single_environments_agree_over_a_million_mixed_steps():
 
 
 def test_every_step_hands_out_new_arrays_unless_told_otherwise():
-    for copy in (True, False):
-        envs = batch(num_envs=3, copy=copy, info_keys=("x",))
+    for new in (True, False):
+        envs = batch(num_envs=3, copy=new, info_keys=("x",))
         first, _ = envs.reset(seed=0)
         kept = first.copy()
         step = envs.step(np.ones((3, 1), np.float32))
         second = [step[0], step[1], step[4]["x"]]
         kept_second = [part.copy() for part in second]
         envs.step(-np.ones((3, 1), np.float32))
-        assert np.array_equal(first, kept) == copy
-        assert [np.array_equal(a, b) for a, b in zip(second, kept_second, strict=True)] == [copy] * 3
+        assert np.array_equal(first, kept) == new
+        assert [np.array_equal(a, b) for a, b in zip(second, kept_second, strict=True)] == [new] * 3
 
 
 def test_the_statistics_are_sums_over_the_episode():
@@ -352,6 +357,75 @@ def test_states_are_taken_and_given_back_to_the_bit():
         assert differences((observation, reward), (first[k][0][2], first[k][1][2])) == []
 
 
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("parameters", [{}, {"geometry": "cubic", "alpha": 0.2}])
+def test_a_state_knows_whether_its_episode_is_over(mode, parameters):
+    envs = batch(num_envs=3, autoreset_mode=mode, episode_steps=6, parameters=parameters).unwrapped
+    envs.reset(seed=0, options={"x": 0.1, "v": 3.0})
+    actions = np.full((3, 1), 0.5, np.float32)
+    states = []
+    for _ in range(6):
+        states.append(envs.get_states())
+        *_, terminated, truncated, _ = envs.step(actions)
+        over = terminated | truncated
+        if over.any():
+            break
+    assert (terminated if parameters else truncated).all()
+    final = envs.get_states()
+    envs.set_states(states[0])  # they run again ...
+    assert envs.call("get_state") == states[0]
+    for _ in states:
+        *_, again_terminated, again_truncated, _ = envs.step(actions)
+    assert ((again_terminated | again_truncated) == over).all()
+    assert envs.get_states() == final
+    envs.reset(seed=1)
+    envs.set_states(final)  # ... and are over again
+    if mode == "Disabled":
+        with pytest.raises(gym.error.ResetNeeded, match="environments 0, 1, 2 have ended"):
+            envs.step(actions)
+    else:
+        envs.step(actions)
+        after_reset = mode == "NextStep"  # with "SameStep" the reset is already behind them
+        assert [state.steps for state in envs.get_states()] == [0 if after_reset else 1] * 3
+        assert [state.episode for state in envs.get_states()] == [1] * 3
+
+
+def test_a_call_that_ends_an_episode_lets_it_be_reset():
+    envs = batch(num_envs=3, episode_steps=4).unwrapped
+    envs.reset(seed=0)
+    for _ in range(4):
+        envs.call_at([1], "step", np.zeros(1, np.float32))
+    *_, info = envs.step(np.zeros((3, 1), np.float32))
+    assert [state.steps for state in envs.get_states()] == [1, 0, 1]
+    assert info["_reward_effort"].tolist() == [True, False, True]
+
+
+def test_a_batch_has_the_states_of_single_environments():
+    ours, single = batch("SDFriction/BeltSpeed-v0", num_envs=2), gym.make("SDFriction/BeltSpeed-v0")
+    ours.reset(seed=4)
+    single.reset(seed=5)
+    for _ in range(20):
+        ours.step(np.ones((2, 1), np.float32))
+        single.step(np.ones(1, np.float32))
+    assert ours.unwrapped.get_states()[1] == single.unwrapped.get_state()
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
+@pytest.mark.parametrize("kwargs", [{}, {"copy": False}, {"threads": 2, "num_envs": 1024}, {"info_keys": "all"}])
+def test_a_copy_steps_on_with_the_same_bits(kwargs, duplicate):
+    envs = batch("SDFriction/BeltSpeedRandomised-v0", episode_steps=20, sensor_delay=2, **kwargs).unwrapped
+    shape = (envs.num_envs, 1)
+    envs.reset(seed=0)
+    for _ in range(15):
+        envs.step(np.full(shape, 0.4))
+    twin = duplicate(envs)
+    for _ in range(10):
+        assert differences(twin.step(np.full(shape, 0.4)), envs.step(np.full(shape, 0.4))) == []
+    masks = [value for name, value in twin.step(np.zeros(shape))[4].items() if name.startswith("_")]
+    assert not any(mask.flags.writeable for mask in masks)
+    assert twin.get_states() != envs.get_states()  # it has a state of its own
+
+
 def test_calls_and_attributes_reach_every_environment():
     envs = batch(num_envs=3)
     assert envs.get_attr("nominal") == (OscillatorParameters(),) * 3
@@ -369,6 +443,23 @@ def test_calls_and_attributes_reach_every_environment():
         envs.set_attr("mark", [1])
     with pytest.raises(AttributeError):
         envs.call("nonsense")
+    assert envs.get_attr("np_random_seed") == (0, 1, 2)
+    envs.call("reset", seed=9)
+    assert envs.get_attr("np_random_seed") == envs.np_random_seed == (9, 9, 9)
+    assert envs.get_states()[0] == envs.get_states()[2]
+
+
+@pytest.mark.parametrize("name", ["reset", "set_state", "step", "get_state"])
+def test_a_call_before_the_first_reset_is_not_lost_in_silence(name):
+    envs = batch(num_envs=2)
+    envs.set_attr("mark", 1)
+    single = gym.make("SDFriction/Force-v0").unwrapped
+    single.reset(seed=0)
+    arguments = {"set_state": [single.get_state()], "step": [np.zeros(1)]}.get(name, [])
+    with pytest.raises(gym.error.ResetNeeded, match="call reset"):
+        envs.call(name, *arguments)
+    assert envs.get_attr("mark") == (1, 1)
+    assert envs.get_attr("render_mode") == (None, None)
 
 
 def test_pictures_of_some_environments_are_those_of_single_ones():
@@ -387,6 +478,29 @@ def test_pictures_of_some_environments_are_those_of_single_ones():
     envs.close()
     single.close()
     assert len(batch(num_envs=40, render_mode="rgb_array").render()) == 16
+
+
+def test_a_picture_shows_the_mode_that_the_step_told(monkeypatch):
+    pytest.importorskip("pygame")
+    from sd_friction_env import rendering
+
+    shown = []
+    monkeypatch.setattr(rendering.Renderer, "draw", lambda self, scene: shown.append(scene))
+    envs = batch(num_envs=3, render_mode="rgb_array", render_envs=[1], force_limit=0.3, info_keys=("mode",))
+    envs.reset(seed=0, options={"phase": 0.9})
+    envs.render()
+    told, undriven = [shown[0].mode], [shown[0].mode]
+    for _ in range(60):
+        info = envs.step(np.ones((3, 1)))[4]  # the push holds the mass on the belt
+        envs.render()
+        assert envs.call_at([1], "render") == [None]
+        state = envs.get_states()[1]
+        told += [int(info["mode"][1])] * 2
+        undriven += [kernel.mode_of(state.parameters.plant, state.x, state.v, state.v_belt, 0.0, 0.0)] * 2
+    assert [scene.mode for scene in shown] == told
+    assert told != undriven
+    with pytest.raises(ValueError, match=r"environment 0 is not drawn: render_envs names those that are, \[1\]"):
+        envs.call("render")
 
 
 def test_the_passive_batch_keeps_the_orbit_solvers_amplitude():
@@ -423,12 +537,18 @@ def test_an_environment_of_the_batch_takes_less_than_a_kibibyte():
         ({"copy": "no"}, "copy must be True or False"),
         ({"info_keys": "x"}, "info_keys must be 'all' or"),
         ({"info_keys": ["y"]}, "info_keys must be one of 'x'"),
+        ({"info_keys": 5}, "info_keys must be 'all' or a sequence of names, got 5"),
+        ({"info_keys": None}, "info_keys must be 'all' or a sequence of names, got None"),
+        ({"info_keys": (name for name in ["x"])}, "info_keys must be 'all' or a sequence of names, got <generator"),
+        ({"info_keys": [5]}, "info_keys must be 'all' or a sequence of names, got 5 among them"),
+        ({"render_envs": 1}, r"render_envs must be None or a sequence of whole numbers in \[0, 2\], got 1"),
         ({"render_mode": "ascii"}, "render_mode must be one of"),
         ({"render_mode": "rgb_array", "render_envs": [9]}, "render_envs must be"),
         ({"render_mode": "rgb_array", "render_envs": [1, 1]}, "render_envs must name each environment once"),
         ({"max_episode_steps": 10}, "use episode_steps"),
         ({"alpha": 0.2}, "unknown argument 'alpha'"),
         ({"parameters": {"alpha": -1}}, "alpha must be"),
+        ({"parameters": {3: 1}}, "parameters must map parameter names to values, got the name 3"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
@@ -443,11 +563,19 @@ def test_bad_arguments_are_named(arguments, message):
         ({"seed": 1.5}, "seed must be None, a whole number"),
         ({"seed": [1, 2]}, "seed must hold 3 seeds"),
         ({"seed": [1, 2, "x"]}, "seed must be"),
+        ({"seed": np.array(3)}, r"seed must be None, a whole number or a sequence of these, got array\(3\)"),
+        ({"seed": b"123"}, "seed must be None, a whole number or a sequence of these, got b'123'"),
         ({"options": 3}, "options must be a mapping"),
         ({"options": [{}]}, "options must be a mapping or 3"),
         ({"options": {"y": 1}}, "unknown option 'y'"),
         ({"options": {"x": [0.1, 0.2]}}, r"options\['x'\] must be one value or 3"),
         ({"options": {"x": [0.1, 0.2, 99.0]}}, r"options\['x'\] must be"),
+        (
+            {"options": {"x": [[0.1], [0.1, 0.2], 0.3]}},
+            r"options\['x'\] must be one value or 3, got \[0.1\] among them",
+        ),
+        ({"options": {"x": np.zeros((3, 1))}}, r"options\['x'\] must be one value or 3, got shape \(3, 1\)"),
+        ({"options": {"parameters": {3: 1}}}, r"options\['parameters'\] must map parameter names .* got the name 3"),
         ({"options": {"parameters": {"alpha": [1.0]}}}, r"options\['parameters'\]\['alpha'\] must be one value or 3"),
         ({"options": {"parameters": {"alpha": [0.5, 0.5, -1.0]}}}, "alpha must be"),
         ({"options": {"parameters": [{}]}}, r"options\['parameters'\] must be a mapping or 3"),
@@ -476,6 +604,10 @@ def test_a_reset_that_is_refused_changes_nothing(arguments, message):
         ([[0.0], [0.0], [-np.inf]], "environment 2 got"),
         ("left", "actions must be"),
         (None, "actions must be"),
+        ([[0.0], [0.0, 1.0], 0.0], "actions must be finite numbers"),
+        ([["1"], ["1"], ["1"]], "actions must be .* of type <U1"),
+        (np.zeros((3, 1), complex), r"(?s)actions must be .* of type complex128"),
+        (np.zeros((3, 1), "m8[s]"), r"(?s)actions must be .* of type timedelta64\[s\]"),
     ],
 )
 def test_bad_actions_are_refused_before_anything_is_stepped(actions, message):
@@ -485,6 +617,118 @@ def test_bad_actions_are_refused_before_anything_is_stepped(actions, message):
     with pytest.raises((TypeError, ValueError), match=message):
         envs.step(actions)
     assert differences(*(each.step(np.ones((3, 1), np.float32)) for each in (envs, twin))) == []
+
+
+def test_an_array_without_axes_is_one_value_for_all():
+    envs = batch(num_envs=3)
+    info = envs.reset(seed=0, options={"x": np.array(0.1), "v": [np.array(0.3), 0.2, np.float32(0.5)]})[1]
+    assert info["x"].tolist() == [0.1] * 3
+    assert info["v"].tolist() == [0.3, 0.2, 0.5]
+    info = envs.reset(options={"parameters": {"alpha": np.array(0.5)}})[1]
+    assert info["parameters"]["alpha"].tolist() == [0.5] * 3
+
+
+def unplaceable(monkeypatch):
+    """Let no episode that has parameters of its own find its start."""
+
+    def refuse(*arguments):
+        raise OrbitError("no start")
+
+    monkeypatch.setattr(kernel, "own_cycle_starts", lambda state, integers, which, phases: np.ones(len(which)))
+    monkeypatch.setattr(Task, "start_state", refuse)
+
+
+@pytest.mark.parametrize("arguments", [{"seed": 5}, {}, {"options": {"reset_mask": np.array([False, True, True])}}])
+def test_a_reset_that_finds_no_start_changes_nothing(arguments, monkeypatch):
+    envs, twin = (batch(num_envs=3, randomise={"alpha": (0.2, 0.9)}).unwrapped for _ in range(2))
+    for each in (envs, twin):
+        each.np_random = np.random.default_rng(4)
+    with monkeypatch.context() as patched:
+        unplaceable(patched)
+        for again in ({}, {"seed": 3}):
+            with pytest.raises(OrbitError):
+                envs.reset(**again)
+    with pytest.raises(gym.error.ResetNeeded):
+        envs.get_states()
+    assert differences(envs.reset(), twin.reset()) == []  # the stream of random numbers is where it was
+    for each in (envs, twin):
+        each.step(np.ones((3, 1), np.float32))
+    with monkeypatch.context() as patched:
+        unplaceable(patched)
+        with pytest.raises(OrbitError):
+            envs.reset(**arguments)
+    assert envs.np_random_seed == twin.np_random_seed == (None,) * 3
+    assert envs.get_states() == twin.get_states()
+    for _ in range(5):
+        assert differences(*(each.step(np.ones((3, 1), np.float32)) for each in (envs, twin))) == []
+    assert differences(envs.reset(), twin.reset()) == []
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_a_step_that_finds_no_start_for_the_next_episodes_can_be_taken_again(mode, monkeypatch):
+    kwargs = {"num_envs": 3, "episode_steps": 4, "randomise": {"alpha": (0.2, 0.9)}, "autoreset_mode": mode}
+    envs, twin = batch(**kwargs).unwrapped, batch(**kwargs).unwrapped
+    actions = np.ones((3, 1), np.float32)
+    for each in (envs, twin):
+        each.reset(seed=0)
+        for _ in range(4 if mode == "NextStep" else 3):
+            each.step(actions)
+    before = envs.get_states()
+    with monkeypatch.context() as patched:
+        unplaceable(patched)
+        for _ in range(2):
+            with pytest.raises(OrbitError):
+                envs.step(actions)
+    if mode == "NextStep":
+        assert envs.get_states() == before
+        assert differences(envs.step(actions), twin.step(actions)) == []
+    else:  # stepped, and waiting for the reset that now succeeds
+        assert differences(envs.step(actions)[0], twin.step(actions)[0]) == []
+    assert [state.episode for state in envs.get_states()] == [1] * 3
+
+
+def states_with(envs, **changes):
+    first, second, third = envs.get_states()
+    return [first, dataclasses.replace(second, **changes), third]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"x": "a"}, r"states\[1\]\.x must be a real number, got 'a'"),
+        ({"x": np.zeros(2)}, r"states\[1\]\.x must be a real number, got array"),
+        ({"v": np.nan}, r"states\[1\]\.v must be finite, got nan"),
+        ({"steps": 1.5}, r"states\[1\]\.steps must be a whole number, got 1\.5"),
+        ({"key": -1}, r"states\[1\]\.key must be in \[0, 2\*\*63\), got -1"),
+        ({"ended": 3}, r"states\[1\]\.ended must be True or False, got 3"),
+        ({"parameters": {}}, r"states\[1\]\.parameters must be OscillatorParameters, got \{\}"),
+        ({"past": ((1.0,),)}, r"states\[1\]\.past must be a tuple of pairs"),
+        ({"past": ((1.0, 2.0), (1.0,))}, r"states\[1\]\.past must be a tuple of pairs"),
+        ({"past": 3}, r"states\[1\]\.past must be a tuple of pairs"),
+    ],
+)
+def test_a_state_made_by_hand_is_refused_before_any_is_taken(changed, message):
+    envs = batch(num_envs=3, sensor_delay=2).unwrapped
+    envs.reset(seed=0)
+    bad = states_with(envs, **changed)
+    envs.step(np.ones((3, 1)))
+    before = envs.get_states()
+    with pytest.raises((TypeError, ValueError), match=message):
+        envs.set_states(bad)
+    assert envs.get_states() == before
+
+
+def test_states_are_as_many_as_environments_and_in_order():
+    envs = batch(num_envs=3).unwrapped
+    envs.reset(seed=0)
+    for bad, message in (
+        (5, "states must be a sequence of 3, .* got 5"),
+        ((state for state in envs.get_states()), "states must be a sequence of 3, .* got <generator"),
+        (envs.get_states()[:2], "states must be 3, one per environment, got 2"),
+        ([1, 2, 3], r"states\[0\] must be an EnvState as get_state\(\) returns it, got 1"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            envs.set_states(bad)
 
 
 def test_stepping_without_an_episode_is_refused():

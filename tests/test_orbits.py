@@ -279,3 +279,12 @@ def test_a_motion_that_neither_gains_nor_loses_is_a_closed_orbit_or_does_not_set
         assert "does not settle" in str(error)  # noqa: PT017 - either is right
     else:
         assert cycle.floquet_multiplier == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("geometry", ["exact", "cubic"])
+def test_the_multiplier_is_one_sided_where_the_orbit_just_above_touches_the_belt(geometry):
+    parameters = OscillatorParameters(geometry=geometry)
+    graze = critical_belt_speeds(parameters).v_b0
+    at, beyond = (limit_cycle(parameters.replace(belt_speed=speed)) for speed in (graze + 1e-9, graze + 2e-3))
+    assert at.kind == beyond.kind == "pure-slip"
+    assert at.floquet_multiplier == pytest.approx(beyond.floquet_multiplier, abs=0.03)

@@ -6,11 +6,13 @@ A finished run is a folder with::
     policy.pt           the best model's weights (a table of tensors; read with weights_only=True)
     policy.npz          the same actor for plain NumPy (sd_friction_env.policies.load_policy)
     evaluations.csv     what each evaluation during training gave
-    checkpoints/        the latest weights and optimiser states
+    checkpoints/        the last checkpoint: in an unfinished run all that is needed to go on as if nothing had happened
     tensorboard/        event files
 
 While it is being trained, the folder is called ``NAME.partial``; it gets its name, and its config.json the status
 "finished", when all else is written. So a half-written folder never looks like a finished one, whatever it is called.
+A run that was interrupted, or killed at any moment, goes on from its last checkpoint (:func:`agents.training.train`):
+``resumed`` in config.json says after how many steps that was done, and with which versions.
 """
 
 import contextlib
@@ -40,6 +42,16 @@ CHECKPOINTS, TENSORBOARD = "checkpoints", "tensorboard"
 PARTIAL = ".partial"
 ALGORITHMS = ("ppo", "sac", "td3", "tqc")
 
+_NEEDED_TO_RESUME = (
+    "algorithm",
+    "device",
+    "environment",
+    "evaluation",
+    "hyperparameters",
+    "seed",
+    "threads",
+    "versions",
+)
 _NEEDED = ("algorithm", "environment", "files", "hyperparameters", "seed", "spaces", "steps", "versions")
 
 
@@ -103,11 +115,37 @@ def begin(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> Pa
     """
     check_free(folder, force=force)
     partial = partial_folder(folder)
-    if partial.exists():
-        shutil.rmtree(partial)
-    partial.mkdir(parents=True)
-    write_json(partial / CONFIG, {"kind": KIND, "format": FORMAT, "status": "unfinished", **config})
+    # Made under other names and renamed: whenever this is killed, what is called partial has its config.json.
+    fresh, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{age}{PARTIAL}") for age in ("new", "old"))
+    for left in (fresh, old):
+        shutil.rmtree(left, ignore_errors=True)
+    fresh.mkdir(parents=True)
+    try:
+        write_unfinished(fresh, config)
+        if partial.exists():
+            os.replace(partial, old)
+        os.replace(fresh, partial)
+    finally:
+        for place in (fresh, old):
+            shutil.rmtree(place, ignore_errors=True)
     return partial
+
+
+def write_unfinished(partial: Path, config: Mapping[str, Any]) -> None:
+    """Write the config.json of a run that is being trained to its partial folder."""
+    write_json(partial / CONFIG, {"kind": KIND, "format": FORMAT, "status": "unfinished", **config})
+
+
+def last_checkpoint(partial: Path) -> Path | None:
+    """Return the last checkpoint of a partial folder; None if there is none yet."""
+    return max((partial / CHECKPOINTS).glob("step_*.pt"), default=None)
+
+
+def remove_leftovers(partial: Path) -> None:
+    """Remove from a partial folder the half-written files that a killed process has left."""
+    for place in (partial, partial / CHECKPOINTS):
+        for file in place.glob(f".*{PARTIAL}"):
+            file.unlink()
 
 
 def finish(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> None:
@@ -150,11 +188,13 @@ def _digest(path: Path) -> str:
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
-    """Write tensors and plain values with torch.save, whole or not at all."""
+    """Write tensors and plain values with torch.save, whole or not at all, also if the machine fails."""
     import torch
 
     with atomic_file(path, "wb") as file:
         torch.save(dict(content), file)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
@@ -206,14 +246,7 @@ def load_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
         partial = partial_folder(place) if place.name else place
         hint = f" (its training did not finish: {str(partial)!r})" if partial.is_dir() else ""
         raise RunFolderError(f"there is no run folder {name!r}{hint}")
-    try:
-        config = json.loads((place / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunFolderError(f"{name!r} is not a run folder: its {CONFIG} cannot be read ({error})") from None
-    if not isinstance(config, dict) or config.get("kind") != KIND:
-        raise RunFolderError(f"{name!r} is not a run folder of sd_friction_env")
-    if config.get("format") != FORMAT:
-        raise RunFolderError(f"{name!r} has run format {config.get('format')!r}; this version reads {FORMAT}")
+    config = _read_config(place)
     if config.get("status") != "finished":
         raise RunFolderError(f"{name!r} is half-written: its training has not finished")
     missing = [key for key in _NEEDED if key not in config]
@@ -227,6 +260,43 @@ def load_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
             raise RunFolderError(f"{name!r} is damaged: {file} is missing or cannot be read") from None
         if digest != config["files"].get(file):
             raise RunFolderError(f"{name!r} is damaged: {file} is not the file that {CONFIG} speaks of")
+    return config
+
+
+def _read_config(place: Path) -> dict[str, Any]:
+    name = str(place)
+    try:
+        config = json.loads((place / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{name!r} is not a run folder: its {CONFIG} cannot be read ({error})") from None
+    if not isinstance(config, dict) or config.get("kind") != KIND:
+        raise RunFolderError(f"{name!r} is not a run folder of sd_friction_env")
+    if config.get("format") != FORMAT:
+        raise RunFolderError(f"{name!r} has run format {config.get('format')!r}; this version reads {FORMAT}")
+    return config
+
+
+def load_unfinished(folder: Path, *, force: bool = False) -> dict[str, Any]:
+    """Return the configuration of the unfinished run that is to become ``folder``; nothing is written.
+
+    Args:
+        folder: of the finished run. force: whether a finished run that is there too may be replaced in the end.
+
+    Raises:
+        RunFolderError: if there is none, it is finished, damaged, of another kind or format, or its name is taken.
+    """
+    partial = partial_folder(folder)
+    if not partial.is_dir():
+        if folder.is_dir():
+            load_config(folder)
+            raise RunFolderError(f"{str(folder)!r} is finished: there is nothing to resume")
+        raise RunFolderError(f"there is nothing to resume: no {str(partial)!r}")
+    if folder.exists() and not force:
+        raise RunFolderError(f"{str(folder)!r} exists: resume with --force to let {str(partial)!r} take its place")
+    config = _read_config(partial)
+    missing = [key for key in _NEEDED_TO_RESUME if key not in config]
+    if missing:
+        raise RunFolderError(f"{str(partial)!r} is damaged: its {CONFIG} lacks {missing[0]!r}")
     return config
 
 

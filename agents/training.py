@@ -6,8 +6,12 @@ import inspect
 import json
 import math
 import numbers
+import os
 import platform
+import random
 import time
+import warnings
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,18 +26,27 @@ import yaml
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
-from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    NormalActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+    VectorizedActionNoise,
+)
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, unwrap_vec_wrapper
 from torch import nn
+from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 import sd_friction_env
 from agents import evaluation, runs
 from sd_friction_env import ENVIRONMENT_IDS, Table
+from sd_friction_env.callbacks import AnnealedExploration
 from sd_friction_env.policies import NetworkPolicy
 from sd_friction_env.sb3 import SDFrictionVecEnv
 from sd_friction_env.wrappers import LARGEST_POWER, LARGEST_SCALE, SMALLEST_POWER, SMALLEST_SCALE, scaled_reward
@@ -49,7 +62,8 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"Tanh": nn.Tanh, "ReLU": nn.ReLU}
 
 LARGEST_SEED = 2**32 - 1
 _WRAPPER = "sd_friction_env.wrappers.ScaledReward"
-_KEPT_CHECKPOINTS = 2
+_CALLBACK = "sd_friction_env.callbacks.AnnealedExploration"
+_CHECKPOINT_FORMAT = 1
 
 
 # Hyperparameters ------------------------------------------------------------------------------------------------------
@@ -110,7 +124,17 @@ _NUMBERS: dict[str, _Number] = {
 }
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 _FLAGS = ("normalize_advantage",)
-_OURS = ("n_envs", "n_timesteps", "frame_stack", "env_wrapper", "policy", "policy_kwargs", "noise_type", "noise_std")
+_OURS = (
+    "n_envs",
+    "n_timesteps",
+    "frame_stack",
+    "env_wrapper",
+    "callback",
+    "policy",
+    "policy_kwargs",
+    "noise_type",
+    "noise_std",
+)
 _NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 _POLICY_NUMBERS = {
     "log_std_init": _Number(-20.0, 5.0),
@@ -124,9 +148,8 @@ def allowed_hyperparameters(algorithm: str) -> tuple[str, ...]:
     """Return the names that hyperparameters of an algorithm may have."""
     taken = set(inspect.signature(ALGORITHMS[algorithm]).parameters)
     names = {*_NUMBERS, *_FLAGS} & taken
-    if "action_noise" not in taken:
-        return tuple(sorted(names | set(_OURS) - {"noise_type", "noise_std"}))
-    return tuple(sorted(names | set(_OURS)))
+    others = {"callback"} if "action_noise" in taken else {"noise_type", "noise_std"}  # what only the others take
+    return tuple(sorted(names | set(_OURS) - others))
 
 
 def read_hyperparameters(algorithm: str, env_id: str, path: Path | None = None) -> dict[str, Any]:
@@ -173,6 +196,8 @@ def _checked_hyperparameter(name: str, value: Any) -> Any:
         return parse_policy_kwargs(value)
     if name == "env_wrapper":
         return _checked_wrapper(value)
+    if name == "callback":
+        return _checked_callback(value)
     if name in _FLAGS:
         if not isinstance(value, bool):
             raise TypeError(f"{name} must be true or false, got {value!r}")
@@ -211,6 +236,23 @@ def _checked_wrapper(value: Any) -> Any:
         _Number(SMALLEST_SCALE, LARGEST_SCALE).check("env_wrapper's scale", arguments["scale"])
         _Number(SMALLEST_POWER, LARGEST_POWER).check("env_wrapper's power", arguments.get("power", 1.0))
     return value
+
+
+def _checked_callback(value: Any) -> Any:
+    entries = value if isinstance(value, list) else [value]
+    for entry in entries:
+        arguments = entry.get(_CALLBACK) if isinstance(entry, dict) and list(entry) == [_CALLBACK] else None
+        if not isinstance(arguments, dict) or not set(arguments) <= {"start", "end"} or len(entries) > 1:
+            raise ValueError(f"callback must be one {_CALLBACK} with its start and end, got {value!r}")
+        AnnealedExploration(**arguments)
+    return value
+
+
+def make_callbacks(settings: Mapping[str, Any]) -> list[BaseCallback]:
+    """Return the callbacks that hyperparameters ask for."""
+    value = settings.get("callback", [])
+    entries = value if isinstance(value, list) else [value]
+    return [AnnealedExploration(**entry[_CALLBACK]) for entry in entries]
 
 
 def reward_scaling(settings: Mapping[str, Any]) -> tuple[float, float]:
@@ -396,6 +438,45 @@ def make_plan(
         settings["n_timesteps"] = _NUMBERS["n_timesteps"].check("timesteps", timesteps)
     if envs is not None:
         settings["n_envs"] = _NUMBERS["n_envs"].check("envs", envs)
+    return _checked_plan(env_id, algorithm, settings, env_kwargs or {}, seed, eval_freq, eval_episodes, device, threads)
+
+
+def plan_of(config: Mapping[str, Any]) -> Plan:
+    """Return the plan of a run's config.json.
+
+    Raises:
+        agents.runs.RunFolderError: if there is none in it.
+    """
+    try:
+        environment, chosen = config["environment"], config["evaluation"]
+        algorithm = _checked_one_of("algorithm", config["algorithm"], tuple(ALGORITHMS))
+        return _checked_plan(
+            _checked_one_of("environment", environment["id"], ENVIRONMENT_IDS),
+            algorithm,
+            check_hyperparameters(algorithm, config["hyperparameters"]),
+            environment["kwargs"],
+            config["seed"],
+            chosen["freq"],
+            chosen["episodes"],
+            config["device"],
+            config["threads"],
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise runs.RunFolderError(f"the run's {runs.CONFIG} cannot be used: {_one_line(error)}") from None
+
+
+def _checked_plan(
+    env_id: str,
+    algorithm: str,
+    settings: dict[str, Any],
+    env_kwargs: Mapping[str, Any],
+    seed: int,
+    eval_freq: int | None,
+    eval_episodes: int,
+    device: str,
+    threads: int,
+) -> Plan:
+    """Return a plan of hyperparameters that are checked one by one already."""
     settings.setdefault("n_envs", 1)
     if "n_timesteps" not in settings:
         raise ValueError("n_timesteps is given neither in the hyperparameters nor by timesteps")
@@ -410,7 +491,7 @@ def make_plan(
         if rollout < 2:
             raise ValueError(f"n_envs x n_steps must be at least 2, got {rollout}")
     try:
-        kwargs = json.loads(json.dumps(dict(env_kwargs or {}), allow_nan=False))
+        kwargs = json.loads(json.dumps(dict(env_kwargs), allow_nan=False))
     except (TypeError, ValueError):
         raise ValueError(f"environment arguments must be plain finite values, got {env_kwargs!r}") from None
     try:
@@ -430,11 +511,20 @@ def make_plan(
         algorithm=algorithm,
         hyperparameters=settings,
         seed=int(_Number(0, LARGEST_SEED, whole=True).check("seed", seed)),
-        eval_freq=int(_POSITIVE.check("eval-freq", eval_freq)),
+        eval_freq=checked_freq("eval-freq", eval_freq),
         eval_episodes=int(_Number(1, most, whole=True).check("eval-episodes", eval_episodes)),
         device=device,
         threads=int(_Number(1, 1024, whole=True).check("threads", threads)),
     )
+
+
+def checked_freq(name: str, value: Any) -> int:
+    """Return a number of environment steps between two events.
+
+    Raises:
+        TypeError, ValueError: if it is no whole number in [1, 1e12].
+    """
+    return int(_POSITIVE.check(name, value))
 
 
 def validation_seeds(plan: Plan) -> range:
@@ -504,7 +594,8 @@ def make_model(plan: Plan, envs: VecEnv) -> BaseAlgorithm:
     noise = plan.hyperparameters.get("noise_type")
     if noise is not None:
         std = plan.hyperparameters.get("noise_std", 0.1)
-        arguments["action_noise"] = _NOISES[noise](mean=np.zeros(1), sigma=np.full(1, std))
+        one: ActionNoise = _NOISES[noise](mean=np.zeros(1), sigma=np.full(1, std))
+        arguments["action_noise"] = VectorizedActionNoise(one, envs.num_envs) if envs.num_envs > 1 else one
     model = ALGORITHMS[plan.algorithm](
         "MlpPolicy",
         envs,
@@ -549,6 +640,136 @@ def network_policy(policy: BasePolicy, frames: int = 1, metadata: Mapping[str, A
     return NetworkPolicy(layers, names.pop() if names else "Tanh", output, frames, dict(metadata or {}))
 
 
+# Checkpoints ----------------------------------------------------------------------------------------------------------
+#
+# They are taken between rollouts, where there is least to keep: PPO's last rollout has been learnt from, and nobody is
+# within a step. What they hold is tensors and plain values, so nothing is executed on loading.
+
+
+def _random_states(model: BaseAlgorithm) -> dict[str, Any]:
+    numpy_state: dict[str, Any] = np.random.get_state(legacy=False)  # noqa: NPY002  Stable-Baselines3 draws from it
+    inner = numpy_state["state"]
+    return {
+        "python": random.getstate(),
+        "numpy": {
+            **numpy_state,
+            "state": {"key": torch.from_numpy(inner["key"].astype(np.int64)), "pos": inner["pos"]},
+        },
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if model.device.type == "cuda" else [],
+        "actions": model.action_space.np_random.bit_generator.state,
+    }
+
+
+def _restore_random_states(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
+    inner = saved["numpy"]["state"]
+    model.action_space.np_random.bit_generator.state = saved["actions"]
+    if model.device.type == "cuda":
+        torch.cuda.set_rng_state_all(saved["cuda"])
+    torch.set_rng_state(saved["torch"])
+    np.random.set_state(  # noqa: NPY002
+        {**saved["numpy"], "state": {"key": inner["key"].numpy().astype(np.uint32), "pos": inner["pos"]}}
+    )
+    random.setstate(saved["python"])
+
+
+def _environment_arrays(envs: VecEnv) -> dict[str, NDArray[Any]]:
+    """Return the very arrays that hold the state of :func:`make_training_envs`, statistics and random keys included."""
+    base = envs.unwrapped
+    assert isinstance(base, SDFrictionVecEnv)
+    arrays = {name: value for name, value in base.envs.__getstate__().items() if isinstance(value, np.ndarray)}
+    stack = unwrap_vec_wrapper(envs, VecFrameStack)
+    if isinstance(stack, VecFrameStack):
+        arrays["stacked observations"] = stack.stacked_obs.stacked_obs
+    return arrays
+
+
+def _replay_arrays(buffer: ReplayBuffer, filled: int) -> dict[str, NDArray[Any]]:
+    names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+    return {name: getattr(buffer, name)[:filled] for name in names}
+
+
+def _noise_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
+    """Return what noises of actions remember, the arrays themselves."""
+    noise: Any = getattr(model, "action_noise", None)
+    parts = enumerate(getattr(noise, "noises", [noise]))
+    return {str(i): part.noise_prev for i, part in parts if isinstance(part, OrnsteinUhlenbeckActionNoise)}
+
+
+def _tensors(arrays: Mapping[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}
+
+
+def _fill(arrays: Mapping[str, NDArray[Any]], saved: Mapping[str, torch.Tensor]) -> None:
+    """Put saved values into arrays, which must be of the same names, shapes and types."""
+    if set(arrays) != set(saved):
+        raise ValueError(f"arrays {sorted(set(arrays) ^ set(saved))} are missing or unknown")
+    for name, array in arrays.items():
+        values = saved[name].numpy()
+        if values.shape != array.shape or values.dtype != array.dtype:
+            raise ValueError(f"{name} is {values.dtype} {values.shape}, not {array.dtype} {array.shape}")
+        array[...] = values
+
+
+_COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")
+
+
+def _model_state(model: BaseAlgorithm, *, at_end: bool) -> dict[str, Any]:
+    """Return all that the rest of a run depends on, as tensors (not copied) and plain values.
+
+    Args:
+        at_end: whether training is over, and nothing will be sampled from a replay buffer any more.
+    """
+    agent: Any = model
+    assert agent.env is not None
+    buffer = None if at_end else getattr(model, "replay_buffer", None)
+    if buffer is not None:
+        filled = buffer.buffer_size if buffer.full else buffer.pos
+        buffer = {"pos": buffer.pos, "full": buffer.full, "arrays": _tensors(_replay_arrays(buffer, filled))}
+    return {
+        "parameters": model.get_parameters(),
+        "variables": {name: recursive_getattr(model, name).detach() for name in agent._get_torch_save_params()[1]},
+        "counters": {name: getattr(model, name) for name in _COUNTERS},
+        "episodes": list(agent.ep_info_buffer),
+        "environments": _tensors(_environment_arrays(agent.env)),
+        "seen": _tensors({"observations": agent._last_obs, "starts": agent._last_episode_starts}),
+        "noises": _tensors(_noise_arrays(model)),
+        "replay": buffer,
+        "random": _random_states(model),
+    }
+
+
+def _restore_model(model: BaseAlgorithm, saved: Mapping[str, Any], steps: int) -> None:
+    """Put an untrained model and its environments where :func:`_model_state` saw them.
+
+    Args:
+        steps: that the run is to do in all.
+
+    The noises of actions are reset when learning starts: they are to be filled again then.
+    """
+    agent: Any = model
+    model.set_parameters(saved["parameters"])
+    for name in agent._get_torch_save_params()[1]:
+        part = recursive_getattr(model, name)
+        recursive_setattr(model, f"{name}.data", saved["variables"][name].to(part.device).reshape(part.shape))
+    for name in _COUNTERS:
+        setattr(model, name, type(getattr(model, name))(saved["counters"][name]))
+    agent.ep_info_buffer = deque(saved["episodes"], maxlen=agent._stats_window_size)
+    agent.ep_success_buffer = deque(maxlen=agent._stats_window_size)  # our episodes tell no success
+    agent._last_obs = agent.env.reset()
+    agent._last_episode_starts = np.ones(agent.env.num_envs, np.bool_)
+    _fill(_environment_arrays(agent.env), saved["environments"])
+    _fill({"observations": agent._last_obs, "starts": agent._last_episode_starts}, saved["seen"])
+    _fill(_noise_arrays(model), saved["noises"])
+    buffer, kept = getattr(model, "replay_buffer", None), saved["replay"]
+    if buffer is not None and model.num_timesteps < steps:
+        buffer.pos, buffer.full = int(kept["pos"]), bool(kept["full"])
+        if not 0 <= buffer.pos < buffer.buffer_size:
+            raise ValueError(f"the replay buffer cannot go on at {buffer.pos}")
+        _fill(_replay_arrays(buffer, buffer.buffer_size if buffer.full else buffer.pos), kept["arrays"])
+    _restore_random_states(model, saved["random"])
+
+
 # Training -------------------------------------------------------------------------------------------------------------
 
 
@@ -590,21 +811,44 @@ def log_episodes(infos: Sequence[Mapping[str, Any]], dones: NDArray[np.bool_], l
                 logger.record_mean(f"episode/{name}", value)
 
 
+class _TensorBoard(TensorBoardOutputFormat):
+    """Event files; those of a resumed run tell readers to forget what was logged after its checkpoint."""
+
+    def __init__(self, folder: Path, resumed_at: int | None) -> None:
+        # Readers take the files in the order of their names, which begin with the second they were made in.
+        seconds = [name.split(".")[3] for name in os.listdir(folder)] if folder.is_dir() else []
+        last = max((int(second) for second in seconds if second.isdecimal()), default=0)
+        time.sleep(min(max(0.0, last + 1.0 - time.time()), 1.0))
+        self.writer = SummaryWriter(log_dir=str(folder), purge_step=None if resumed_at is None else resumed_at + 1)
+        self._is_closed = False
+
+
 class _Supervisor(BaseCallback):
     """Watches a run: statistics, evaluation, the best model, checkpoints, progress, and the wish to stop."""
 
-    def __init__(self, plan: Plan, folder: Path, progress: bool, should_stop: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        folder: Path,
+        progress: bool,
+        should_stop: Callable[[], bool],
+        on_evaluation: Callable[[Mapping[str, Any]], None],
+        checkpoint_freq: int,
+    ) -> None:
         super().__init__()
         self.plan = plan
         self.folder = folder
         self.should_stop = should_stop
+        self.on_evaluation = on_evaluation
+        self.checkpoint_freq = checkpoint_freq
         self.stopped = False
         self.rows: list[dict[str, Any]] = []
         self.best: dict[str, Any] = {}
-        self.best_key = (-math.inf, -math.inf)
         self.best_weights: dict[str, torch.Tensor] = {}
-        self.next_evaluation = plan.eval_freq
+        self.next_evaluation = self.next_checkpoint = 0
         self.seeds = validation_seeds(plan)
+        self.seconds = 0.0  # of training in processes before this one
+        self.noises: Mapping[str, torch.Tensor] = {}  # to go on with
         self.started = time.perf_counter()
         self.bar = tqdm(
             total=plan.steps,
@@ -616,22 +860,64 @@ class _Supervisor(BaseCallback):
             mininterval=0.5,
         )
 
+    def restore(self, saved: Mapping[str, Any], noises: Mapping[str, torch.Tensor], logger: Logger) -> None:
+        """Go on from what a checkpoint holds, and make the folder's tables and best model those of that moment.
+
+        Args:
+            saved: as :meth:`own_state` returned it. noises: as :func:`_model_state` has them.
+        """
+        self.rows, self.best, self.best_weights = saved["rows"], saved["best"], saved["best_weights"]
+        self.seconds, self.noises = saved["seconds"], noises
+        for name, (value, count, excluded) in saved["logged"].items():
+            logger.name_to_value[name], logger.name_to_excluded[name] = value, tuple(excluded)
+            if count:
+                logger.name_to_count[name] = count
+        if self.rows:
+            self.table().to_csv(self.folder / runs.EVALUATIONS)
+            runs.save_tensors(self.folder / runs.WEIGHTS, self.best_weights)
+        else:
+            for name in (runs.EVALUATIONS, runs.WEIGHTS):
+                (self.folder / name).unlink(missing_ok=True)
+
+    def own_state(self) -> dict[str, Any]:
+        """Return what is here, as tensors and plain values."""
+        values, counts, excluded = self.logger.name_to_value, self.logger.name_to_count, self.logger.name_to_excluded
+        return {
+            "rows": self.rows,
+            "best": self.best,
+            "best_weights": self.best_weights,
+            "seconds": time.perf_counter() - self.started,
+            "logged": {name: (float(value), counts.get(name, 0), excluded[name]) for name, value in values.items()},
+        }
+
     def _on_training_start(self) -> None:
-        self.started = time.perf_counter()
+        self.started = time.perf_counter() - self.seconds
         (self.folder / runs.CHECKPOINTS).mkdir(exist_ok=True)
+        if self.noises:  # they have just been reset
+            _fill(_noise_arrays(self.model), self.noises)
+        self.next_evaluation = self._after_now(self.plan.eval_freq)
+        self.next_checkpoint = self._after_now(self.checkpoint_freq)
+        self.bar.initial = self.bar.n = min(self.num_timesteps, self.plan.steps)
+
+    def _after_now(self, freq: int) -> int:
+        return (self.num_timesteps // freq + 1) * freq
 
     def _on_step(self) -> bool:
         log_episodes(self.locals["infos"], self.locals["dones"], self.logger)
         self.bar.update(min(self.num_timesteps, self.plan.steps) - self.bar.n)
-        self.stopped = self.should_stop()
-        return not self.stopped
+        self.stopped = self.stopped or self.should_stop()
+        return True
 
     def _on_rollout_start(self) -> None:
-        # Between rollouts: PPO's policy does not change during one.
-        if self.num_timesteps >= self.next_evaluation and self.num_timesteps < self.plan.steps:
-            self.next_evaluation = (self.num_timesteps // self.plan.eval_freq + 1) * self.plan.eval_freq
+        # Between rollouts: PPO's policy does not change during one, and a checkpoint in the middle could not be exact.
+        if self.num_timesteps >= self.next_evaluation:
+            self.next_evaluation = self._after_now(self.plan.eval_freq)
             self.evaluate()
-            self.save_checkpoint()
+        if self.stopped or self.num_timesteps >= self.next_checkpoint:
+            self.next_checkpoint = self._after_now(self.checkpoint_freq)
+            checkpoint = self.save_checkpoint()
+            if self.stopped:
+                raise StoppedError(self.num_timesteps, checkpoint)
 
     def actor(self) -> NetworkPolicy:
         """Return the present actor."""
@@ -674,24 +960,27 @@ class _Supervisor(BaseCallback):
         for name, value in row.items():
             if name != "steps":
                 self.logger.record(f"eval/{name}", value)
-        key = (row["credited_return"], row["mean_return"])
-        if key > self.best_key:
-            self.best, self.best_key = row, key
+        names = ("credited_return", "mean_return")
+        if not self.best or [row[name] for name in names] > [self.best[name] for name in names]:
+            self.best = row
             self.best_weights = {name: part.detach().clone() for name, part in self.model.policy.state_dict().items()}
             runs.save_tensors(self.folder / runs.WEIGHTS, self.best_weights)
         self.bar.set_postfix_str(f"return {row['mean_return']:.1f}, suppressed {row['suppressed']:.0%}")
+        self.on_evaluation(dict(row))
 
     def table(self) -> Table:
         """Return all evaluations so far."""
         return Table({name: [row[name] for row in self.rows] for name in self.rows[0]})
 
-    def save_checkpoint(self) -> Path:
-        """Write weights and optimiser states, remove all but the last few, and return the new file."""
+    def save_checkpoint(self, *, at_end: bool = False) -> Path:
+        """Write all that is needed to go on from here, remove earlier checkpoints, and return the new file."""
         place = self.folder / runs.CHECKPOINTS
         path = place / f"step_{self.num_timesteps:012d}.pt"
-        runs.save_tensors(path, {"steps": self.num_timesteps, "parameters": self.model.get_parameters()})
-        for old in sorted(place.glob("step_*.pt"))[:-_KEPT_CHECKPOINTS]:
-            old.unlink()
+        content = {"format": _CHECKPOINT_FORMAT, "steps": self.num_timesteps, "run": self.own_state()}
+        runs.save_tensors(path, content | _model_state(self.model, at_end=at_end))
+        for old in place.glob("step_*.pt"):
+            if old != path:
+                old.unlink()
         return path
 
 
@@ -700,25 +989,47 @@ def train(
     folder: Path,
     *,
     force: bool = False,
+    resume: bool = False,
+    checkpoint_freq: int | None = None,
     progress: bool = True,
     command: str = "",
     should_stop: Callable[[], bool] = lambda: False,
+    on_evaluation: Callable[[Mapping[str, Any]], None] = lambda row: None,
 ) -> Result:
     """Train an agent and write its run folder (see :mod:`agents.runs`).
 
     The global random states of random, NumPy and torch are seeded: Stable-Baselines3 draws from them.
 
+    A run that was stopped or killed goes on from its last checkpoint, or begins anew if it had none yet. On the CPU the
+    result is bit for bit that of a run which was not interrupted, but for wall times; rows of evaluations.csv and
+    TensorBoard's events from after the checkpoint are dropped, for they come again. On CUDA it is as exact as two runs
+    of the same seed are there.
+
     Args:
         folder: of the finished run. force: replace a run that is there.
+        resume: go on with the unfinished run of this plan.
+        checkpoint_freq: environment steps between two checkpoints, which are taken between rollouts; None: what an
+            unfinished run had, or else as often as it is evaluated.
         progress: show a progress bar on standard error. command: what the user typed, for the record.
-        should_stop: asked after every step; once it says True, training stops with a last checkpoint.
+        should_stop: asked after every step; once it says True, training stops after the rollout that is running and
+            what is learnt from it, with a last checkpoint.
+        on_evaluation: called with every new row of evaluations.csv; it may raise to end the training.
+
+    Warns:
+        UserWarning: if a run is resumed with other versions than it was begun with.
 
     Raises:
-        agents.runs.RunFolderError: if the folder is taken; nothing is then written.
-        StoppedError: if ``should_stop`` said so; the folder keeps its partial name.
+        TypeError, ValueError: if ``checkpoint_freq`` is no whole number in [1, 1e12].
+        agents.runs.RunFolderError: if the folder is taken, or there is nothing to resume, or what is there is damaged
+            or of another plan; nothing is then written.
+        StoppedError: if ``should_stop`` said so; the folder keeps its partial name, also if ``on_evaluation`` raises.
     """
     frames = int(plan.hyperparameters.get("frame_stack", 1))
-    runs.check_free(folder, force=force)
+    runs.check_free(folder, force=force or resume)
+    begun = runs.load_unfinished(folder, force=force) if resume else None
+    if checkpoint_freq is None:
+        checkpoint_freq = (begun or {}).get("checkpoint_freq", plan.eval_freq)
+    checkpoint_freq = checked_freq("checkpoint-freq", checkpoint_freq)
     threads = torch.get_num_threads()
     torch.set_num_threads(plan.threads)
     envs = make_training_envs(
@@ -733,45 +1044,60 @@ def train(
     logger: Logger | None = None
     try:
         model = make_model(plan, envs)
-        config = {
-            "environment": {"id": plan.env_id, "kwargs": dict(plan.env_kwargs), "frame_stack": frames},
-            "algorithm": plan.algorithm,
-            "hyperparameters": dict(plan.hyperparameters),
-            "seed": plan.seed,
-            "evaluation": {
-                "freq": plan.eval_freq,
-                "episodes": plan.eval_episodes,
-                "first_seed": validation_seeds(plan)[0],
-            },
-            "device": plan.device,
-            "threads": plan.threads,
+        config = configuration(plan) | {
             "spaces": {
                 "observation": runs.describe_space(envs.observation_space),
                 "action": runs.describe_space(envs.action_space),
             },
+            "checkpoint_freq": checkpoint_freq,
             "versions": versions(),
             "command": command,
         }
-        partial = runs.begin(folder, config, force=force)
-        logger = Logger(None, [TensorBoardOutputFormat(str(partial / runs.TENSORBOARD))])
+        partial = runs.partial_folder(folder)
+        saved: dict[str, Any] | None = None
+        if begun is not None:
+            check_same(begun, plan, partial)
+            checkpoint = runs.last_checkpoint(partial)
+            if checkpoint is not None:
+                saved = _load_checkpoint(checkpoint, model, plan)
+        if saved is None:
+            runs.begin(folder, config, force=force or resume)
+        else:
+            assert begun is not None
+            then = {**begun["versions"], **(begun.get("resumed") or [{}])[-1].get("versions", {})}
+            changed = [f"{name} {then.get(name)} -> {now}" for name, now in versions().items() if then.get(name) != now]
+            if changed:
+                warnings.warn(f"the run was begun with other versions: {', '.join(changed)}", stacklevel=2)
+            config |= {name: begun[name] for name in ("versions", "command") if name in begun}
+            config["resumed"] = [*begun.get("resumed", []), {"steps": model.num_timesteps, "versions": versions()}]
+            runs.write_unfinished(partial, config)
+            runs.remove_leftovers(partial)
+        resumed_at = None if saved is None else model.num_timesteps
+        logger = Logger(None, [_TensorBoard(partial / runs.TENSORBOARD, resumed_at)])
         model.set_logger(logger)
-        supervisor = _Supervisor(plan, partial, progress, should_stop)
+        supervisor = _Supervisor(plan, partial, progress, should_stop, on_evaluation, checkpoint_freq)
+        if saved is not None:
+            supervisor.restore(saved["run"], saved["noises"], logger)
         # Off-policy algorithms log per episode, and all environments end theirs together.
         log_interval = 1 if plan.algorithm == "ppo" else plan.hyperparameters["n_envs"]
-        model.learn(plan.steps, callback=supervisor, log_interval=log_interval)
-        if supervisor.stopped:
-            raise StoppedError(model.num_timesteps, supervisor.save_checkpoint())
-        seconds = time.perf_counter() - supervisor.started
-        supervisor.evaluate()
-        logger.dump(model.num_timesteps)
-        supervisor.save_checkpoint()
+        model.learn(
+            plan.steps - (resumed_at or 0),
+            callback=[*make_callbacks(plan.hyperparameters), supervisor],
+            log_interval=log_interval,
+            reset_num_timesteps=saved is None,
+        )
+        if not supervisor.rows or supervisor.rows[-1]["steps"] < model.num_timesteps:  # else it was killed after this
+            supervisor.evaluate()
+            logger.dump(model.num_timesteps)
+            supervisor.save_checkpoint(at_end=True)
+        seconds = supervisor.rows[-1]["seconds"]
         model.policy.load_state_dict(supervisor.best_weights)
         actor = dataclasses.replace(
             supervisor.actor(), metadata={**supervisor.actor().metadata, "steps": supervisor.best["steps"]}
         )
         actor.save(partial / runs.NETWORK)
         logger.close()
-        config |= {"steps": model.num_timesteps, "seconds": round(seconds, 3), "best": supervisor.best}
+        config |= {"steps": model.num_timesteps, "seconds": seconds, "best": supervisor.best}
         runs.finish(folder, config, force=force)
         return Result(folder, actor, model.num_timesteps, seconds, supervisor.best, supervisor.table())
     finally:
@@ -781,6 +1107,75 @@ def train(
             logger.close()
         envs.close()
         torch.set_num_threads(threads)
+
+
+def configuration(plan: Plan) -> dict[str, Any]:
+    """Return a plan as a run's config.json has it (JSON values)."""
+    return {
+        "environment": {
+            "id": plan.env_id,
+            "kwargs": dict(plan.env_kwargs),
+            "frame_stack": int(plan.hyperparameters.get("frame_stack", 1)),
+        },
+        "algorithm": plan.algorithm,
+        "hyperparameters": dict(plan.hyperparameters),
+        "seed": plan.seed,
+        "evaluation": {
+            "freq": plan.eval_freq,
+            "episodes": plan.eval_episodes,
+            "first_seed": validation_seeds(plan)[0],
+        },
+        "device": plan.device,
+        "threads": plan.threads,
+    }
+
+
+def check_same(config: Mapping[str, Any], plan: Plan, place: Path) -> None:
+    """Raise unless a plan is the one that the configuration of the run at ``place`` was made from.
+
+    Raises:
+        agents.runs.RunFolderError: naming the first difference.
+    """
+    ours, theirs = (
+        _flat(part) for part in (configuration(plan), {name: config.get(name) for name in configuration(plan)})
+    )
+    for name in [*theirs, *ours]:
+        if ours.get(name) != theirs.get(name) or (name in ours) != (name in theirs):
+            was, now = (repr(part[name]) if name in part else "not given" for part in (theirs, ours))
+            raise runs.RunFolderError(
+                f"{str(place)!r} is a run with another configuration: {name} is {was} there and {now} here; "
+                "resume it with --run-folder and --resume alone, or replace it with --force and without --resume"
+            )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    parts: dict[str, Any] = {}
+    for name, value in json.loads(json.dumps(values)).items():
+        parts |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return parts
+
+
+def _load_checkpoint(path: Path, model: BaseAlgorithm, plan: Plan) -> dict[str, Any]:
+    """Restore a model from a checkpoint, and return what the checkpoint holds.
+
+    Raises:
+        agents.runs.RunFolderError: if it is damaged, of another format or of another run.
+    """
+    saved = runs.load_tensors(path)
+    if saved.get("format") != _CHECKPOINT_FORMAT:
+        raise runs.RunFolderError(
+            f"checkpoint {str(path)!r} has format {saved.get('format')!r}, and this version resumes "
+            f"{_CHECKPOINT_FORMAT}: begin anew with --force and without --resume"
+        )
+    try:
+        _restore_model(model, saved, plan.steps)
+        if not {"rows", "best", "best_weights", "seconds", "logged"} <= set(saved["run"]):
+            raise ValueError("the record of the run is incomplete")
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise runs.RunFolderError(
+            f"checkpoint {str(path)!r} is damaged or of another run: {_one_line(error)[:300]}"
+        ) from None
+    return saved
 
 
 def versions() -> dict[str, str]:

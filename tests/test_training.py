@@ -93,7 +93,9 @@ def test_a_run_folder_describes_itself(finished):
     table = Table.from_csv(finished / "evaluations.csv")
     assert table["steps"].tolist() == [128.0, 256.0]
     assert config["best"]["mean_return"] == table["mean_return"].max()
-    assert len(list((finished / "checkpoints").iterdir())) == 2
+    assert [path.name for path in (finished / "checkpoints").iterdir()] == ["step_000000000256.pt"]
+    assert config["checkpoint_freq"] == 128
+    assert "resumed" not in config
 
 
 def test_the_two_forms_of_an_agent_act_alike_after_loading(finished):
@@ -198,11 +200,12 @@ def test_what_is_no_run_is_never_replaced(tmp_path):
 
 def test_a_run_that_was_stopped_is_never_taken_for_a_finished_one(tmp_path):
     calls = iter(range(1000))
-    with pytest.raises(training.StoppedError, match="after 160 steps") as stop:
-        training.train(tiny_plan(), tmp_path / "run", progress=False, should_stop=lambda: next(calls) >= 39)
+    plan = tiny_plan(timesteps=512)
+    with pytest.raises(training.StoppedError, match="after 256 steps") as stop:  # the rollout is ended first
+        training.train(plan, tmp_path / "run", progress=False, should_stop=lambda: next(calls) >= 39)
     partial = tmp_path / "run.partial"
     assert [path.name for path in tmp_path.iterdir()] == ["run.partial"]
-    assert runs.load_tensors(stop.value.checkpoint)["steps"] == 160
+    assert runs.load_tensors(stop.value.checkpoint)["steps"] == 256
     with pytest.raises(runs.RunFolderError, match="did not finish"):
         runs.load_config(tmp_path / "run")
     with pytest.raises(runs.RunFolderError, match="half-written"):
@@ -311,8 +314,9 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
     assert process.returncode == 130
     assert "interrupted" in errors
     assert "Traceback" not in errors
-    last = max(checkpoints.glob("step_*.pt"))
+    (last,) = checkpoints.glob("step_*.pt")
     assert str(last) in errors
+    assert f"--run-folder {tmp_path / 'run'} --resume" in errors
     parameters = runs.load_tensors(last)["parameters"]
     assert {"policy", "policy.optimizer"} <= set(parameters)
 
@@ -329,6 +333,7 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
         (["--envs", "-1"], "envs must be a whole number in [1, 65536], got -1"),
         (["--seed", "4294967296"], "seed must be a whole number in [0, 4294967295], got 4294967296"),
         (["--eval-freq", "0"], "eval-freq must be"),
+        (["--checkpoint-freq", "0"], "checkpoint-freq must be a whole number in [1, 1000000000000], got 0"),
         (["--eval-episodes", "101"], "eval-episodes must be a whole number in [1, 100], got 101"),
         (["--threads", "0"], "threads must be"),
         (["--device", "abacus"], "device must be one of cpu, auto"),

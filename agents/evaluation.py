@@ -4,6 +4,7 @@ Every metric is taken from what the integrator reports of whole control interval
 the belt's speed), never from samples at their ends.
 """
 
+import contextlib
 import functools
 import json
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
+import scipy.stats
+from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env import SDFrictionEnv, SDFrictionVectorEnv, Table
 from sd_friction_env.policies import Policy, State, ZeroPolicy
@@ -71,15 +73,18 @@ def run_episodes(
     env_id: str,
     seeds: Sequence[int] = EVALUATION_SEEDS,
     env_kwargs: Mapping[str, Any] | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Episodes:
     """Run one episode from ``reset(seed=...)`` for each seed, all side by side, and return what happened.
 
     Args:
         policy: acts on the batch of all observations.
         env_id: of one of our environments. seeds: at least one, each at least 0. env_kwargs: of the environment.
+        options: of the reset, as :class:`SDFrictionVectorEnv` takes them, such as parameters of each episode.
 
     Raises:
-        TypeError, ValueError: if there is no seed, one is no such number, or the policy does not fit the environment.
+        TypeError, ValueError: if there is no seed, one is no such number, an option is not as said, or the policy does
+            not fit the environment.
     """
     seeds = [int(seed) for seed in seeds]
     if not seeds or min(seeds) < 0:
@@ -90,7 +95,7 @@ def run_episodes(
     envs = made.unwrapped
     assert isinstance(envs, SDFrictionVectorEnv)
     steps = envs.task.episode_steps
-    observations, _ = envs.reset(seed=seeds)
+    observations, _ = envs.reset(seed=seeds, options=options)
     belt_speed = np.array([parameters.belt_speed for parameters in envs.get_attr("parameters")])
     record = np.full((steps, 2 + len(_RECORDED), n), np.nan)
     v_belt = belt_speed.copy()
@@ -240,39 +245,119 @@ def _passive_episodes(env_id: str, seeds: tuple[int, ...], env_kwargs: str) -> E
     return run_episodes(ZeroPolicy(), env_id, seeds, json.loads(env_kwargs))
 
 
-# The score ------------------------------------------------------------------------------------------------------------
+# The optimum ----------------------------------------------------------------------------------------------------------
 
 
 def optimal_returns(env_id: str, seeds: Sequence[int], env_kwargs: Mapping[str, Any] | None = None) -> Array | None:
-    """Return the best known return from each start, shape (n,); None where no optimum is stored (other arguments, the
-    hard tiers, other seeds)."""
+    """Return the best known return from each start, shape (n,), NaN where none is stored; None where none is at all
+    (other arguments, tiers without an optimum, other seeds)."""
     if env_kwargs:
         return None
     try:
         from agents import optimal
     except ImportError:
         return None
-    try:
-        returns = optimal.optimal_returns(env_id, list(seeds))
-    except (FileNotFoundError, ValueError):
-        return None
-    return None if returns is None else np.asarray(returns, dtype=float)
+    known = np.full(len(seeds), np.nan)
+    for i, seed in enumerate(seeds):
+        with contextlib.suppress(FileNotFoundError, ValueError):
+            returns = optimal.optimal_returns(env_id, [int(seed)])
+            if returns is None:
+                return None
+            known[i] = returns[0]
+    return known if np.isfinite(known).any() else None
 
 
-def score(returns: Any, passive: Any, optimal: Any) -> float:
-    """Return (mean return - mean passive)/(mean optimal - mean passive) over the same episodes: 0 passive, 1 optimal.
+# The score and its interval -------------------------------------------------------------------------------------------
+
+CONFIDENCE = 0.95
+RESAMPLES = 2000  # of a bootstrap
+Interval = tuple[float, float]
+_NO_INTERVAL: Interval = (float("nan"), float("nan"))
+
+
+def _compared(returns: ArrayLike, passive: ArrayLike, optimal: ArrayLike) -> Array:
+    """Return the three, shape (3, n), in the episodes of which the optimum is known (not NaN).
 
     Raises:
-        ValueError: if the three are not of one shape, or the optimum is no better than passive.
+        ValueError: if the three are not of one shape, or there is no such episode.
     """
-    returns, passive, optimal = (np.asarray(values, dtype=float) for values in (returns, passive, optimal))
-    if not returns.shape == passive.shape == optimal.shape or returns.size == 0:
-        shapes = f"{returns.shape}, {passive.shape}, {optimal.shape}"
+    parts = [np.asarray(values, dtype=float) for values in (returns, passive, optimal)]
+    if len({part.shape for part in parts}) > 1 or parts[0].ndim != 1 or not np.isfinite(parts[2]).any():
+        shapes = ", ".join(str(part.shape) for part in parts)
         raise ValueError(f"returns, passive and optimal must be of the same episodes, got shapes {shapes}")
-    gap = optimal.mean() - passive.mean()
+    return np.stack(parts)[:, np.isfinite(parts[2])]
+
+
+def score(returns: ArrayLike, passive: ArrayLike, optimal: ArrayLike) -> float:
+    """Return (mean return - mean passive)/(mean optimal - mean passive) over the same episodes: 0 passive, 1 optimal.
+
+    Episodes of which the optimum is not known (NaN) are left out.
+
+    Raises:
+        ValueError: if the three are not of one shape (n,), or the optimum is no better than passive.
+    """
+    mean, mean_passive, mean_optimal = _compared(returns, passive, optimal).mean(axis=1).tolist()
+    gap = mean_optimal - mean_passive
     if not gap > 0.0:
-        raise ValueError(f"the optimum must be better than passive, got means {optimal.mean()} and {passive.mean()}")
-    return float((returns.mean() - passive.mean()) / gap)
+        raise ValueError(f"the optimum must be better than passive, got means {mean_optimal} and {mean_passive}")
+    return float((mean - mean_passive) / gap)
+
+
+def score_interval(
+    returns: ArrayLike, passive: ArrayLike, optimal: ArrayLike, *, seed: int = 0, resamples: int = RESAMPLES
+) -> Interval:
+    """Return the 95% interval of a score: the percentile bootstrap over episodes, the three resampled together.
+
+    Args:
+        returns, passive, optimal: as :func:`score` takes them; fewer than two episodes have no interval (NaN).
+        seed: of the resampling. resamples: how many.
+    """
+    compared = _compared(returns, passive, optimal)
+    n = compared.shape[1]
+    if n < 2:
+        return _NO_INTERVAL
+    drawn = np.random.default_rng(seed).integers(n, size=(resamples, n))
+    mean, mean_passive, mean_optimal = (values[drawn].mean(axis=1) for values in compared)
+    return _middle((mean - mean_passive) / (mean_optimal - mean_passive))
+
+
+def _middle(values: Array) -> Interval:
+    low, high = np.quantile(values, (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE)).tolist()
+    return low, high
+
+
+def share_interval(hits: int, of: int) -> Interval:
+    """Return the 95% interval of a share, by Wilson's score (unlike a bootstrap, it is not empty at 0 and 1)."""
+    found = scipy.stats.binomtest(hits, of).proportion_ci(CONFIDENCE, method="wilson")
+    return float(found.low), float(found.high)
+
+
+def interquartile_mean(values: ArrayLike) -> float:
+    """Return the mean of the middle half of all values (a quarter of them, rounded down, is cut at each end)."""
+    return float(scipy.stats.trim_mean(np.ravel(values), 0.25))
+
+
+def run_interval(scores: Sequence[ArrayLike], *, seed: int = 0, resamples: int = RESAMPLES) -> Interval:
+    """Return the 95% interval of the interquartile mean over training runs, by the stratified bootstrap.
+
+    Runs are resampled with replacement within each task, and the interquartile mean is taken over all of them (Agarwal
+    et al., "Deep reinforcement learning at the edge of the statistical precipice", 2021).
+
+    Args:
+        scores: of each task, those of its runs, shape (runs,). With one run for each task there is no interval (NaN).
+        seed: of the resampling. resamples: how many.
+
+    Raises:
+        ValueError: if there is no task, or one has no runs.
+    """
+    tasks = [np.asarray(task, dtype=float) for task in scores]
+    if not tasks or any(task.ndim != 1 or not task.size for task in tasks):
+        raise ValueError(f"scores must be one or more sequences of one or more numbers, got {scores!r}")
+    if max(task.size for task in tasks) < 2:
+        return _NO_INTERVAL
+    rng = np.random.default_rng(seed)
+    drawn = [task[rng.integers(task.size, size=(resamples, task.size))] for task in tasks]
+    return _middle(np.asarray(scipy.stats.trim_mean(np.concatenate(drawn, axis=1), 0.25, axis=1)))
 
 
 # Name in a summary, column it is the mean of. NaN (ended early, never settled) is left out of means.
@@ -287,16 +372,25 @@ _SUMMARY = {
 }
 
 
-def summarise(name: str, table: Table, passive: Table, optimal: Array | None) -> dict[str, Any]:
-    """Return one row for a controller: means over its episodes, its score and its suppressed fraction.
+def summarise(
+    name: str, table: Table, passive: Table, optimal: Array | None, *, seed: int = 0, resamples: int = RESAMPLES
+) -> dict[str, Any]:
+    """Return one row for a controller: means over its episodes, its score and its suppressed fraction, both with the
+    ends of their 95% intervals (``score_low`` and so on).
 
     Args:
         name: of the controller. table: of :func:`metrics`. passive: the same for no control.
-        optimal: best returns of the same starts, or None (the score then is NaN).
+        optimal: best returns of the same starts, NaN where unknown, or None (the score then is NaN).
+        seed, resamples: of the score's bootstrap.
     """
     row: dict[str, Any] = {"controller": name, "return": float(table["return"].mean())}
-    row["score"] = float("nan") if optimal is None else score(table["return"], passive["return"], optimal)
+    row["score"], (row["score_low"], row["score_high"]), row["scored_episodes"] = float("nan"), _NO_INTERVAL, 0
+    if optimal is not None:
+        returns = table["return"], passive["return"], optimal
+        row["score"], row["scored_episodes"] = score(*returns), int(np.isfinite(optimal).sum())
+        row["score_low"], row["score_high"] = score_interval(*returns, seed=seed, resamples=resamples)
     row["suppressed"] = float(table["suppressed"].mean())
+    row["suppressed_low"], row["suppressed_high"] = share_interval(int(table["suppressed"].sum()), table.n_rows)
     for key, column in _SUMMARY.items():
         finite = table[column][np.isfinite(table[column])]
         row[key] = float(finite.mean()) if finite.size else float("nan")
@@ -321,14 +415,15 @@ _FORMATS = {
 
 
 def format_summary(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return rows of :func:`summarise` as an aligned text table; "-" where there is no number."""
+    """Return rows of :func:`summarise` as an aligned text table, intervals in brackets, "-" for no number."""
     names = ["controller", *_FORMATS]
     cells = [[name.replace("_", " ") for name in names]]
     for row in rows:
         line = [str(row["controller"])]
         for name, form in _FORMATS.items():
-            value = row.get(name, float("nan"))
-            line.append(form.format(value) if np.isfinite(value) else "-")
+            value, low, high = (row.get(key, float("nan")) for key in (name, f"{name}_low", f"{name}_high"))
+            interval = f" [{form.format(low)}, {form.format(high)}]" if np.isfinite(low) else ""
+            line.append(form.format(value) + interval if np.isfinite(value) else "-")
         cells.append(line)
     widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
     lines = []

@@ -4,10 +4,11 @@
     python scripts/evaluate.py runs/belt-nominal-ppo-0 runs/belt-nominal-ppo-1 --controller constant --csv table.csv
     python scripts/evaluate.py --task belt --controller velocity-feedback --gain -1
 
-Passive always stands first. score: 0 passive, 1 the optimum where one is stored ("-" where none is); suppressed: share
-of the episodes that end still (amplitude under 5% of passive), without stick, at nominal belt speed. Amplitude,
-reduction, stick and belt speed are of the last half of the episodes; settling is the mean time of those that settle;
-residual is the rms action of the last quarter.
+Passive always stands first. score: 0 passive, 1 the optimum where one is stored ("-" where none is), over the episodes
+whose optimum is known; suppressed: share of the episodes that end still (amplitude under 5% of passive), without stick,
+at nominal belt speed; both with 95% intervals over the episodes. Amplitude, reduction, stick and belt speed are of the
+last half of the episodes; settling is the mean time of those that settle; residual is the rms action of the last
+quarter. --controller classical stands for all classical controllers that were tuned for the environment.
 """
 
 import argparse
@@ -17,12 +18,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents import evaluation, runs
+import numpy as np
+
+from agents import classical, evaluation, runs
 from scripts.train import TASKS, TIERS, Parser, assignments, environment_id
 from sd_friction_env import ENVIRONMENT_IDS, Table
 from sd_friction_env.policies import ConstantPolicy, Policy, PolicyFileError, VelocityFeedback, ZeroPolicy, load_policy
 
-CONTROLLERS = ("passive", "velocity-feedback", "constant")
+CONTROLLERS = ("passive", "velocity-feedback", "constant", "classical")
 # Force: near the best there is. Belt: the belt follows the mass, which makes matters worse at any gain (negative gains
 # help a little and suppress nothing).
 VELOCITY_GAINS = {"force": 1.5, "belt_speed": 1.0}
@@ -93,6 +96,10 @@ def controllers(names: Sequence[str], gain: float | None, env_id: str, env_kwarg
     for name in names:
         if name == "constant":
             made |= {"constant -1": ConstantPolicy(-1.0), "constant +1": ConstantPolicy(1.0)}
+        elif name == "classical":
+            if env_kwargs:
+                raise ValueError("--controller classical was tuned without --env-arg: leave one of them out")
+            made |= classical.classical_controllers(env_id)
         elif name == "velocity-feedback":
             env = evaluation.make_env(env_id, env_kwargs)
             used = VELOCITY_GAINS[env.task.actuator] if gain is None else gain
@@ -148,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 rows.append(evaluation.summarise(name, table, passive_table, optimal))
                 all_episodes.append((env_id, name, table))
             if optimal is not None:
-                rows.append({"controller": "optimum", "return": float(optimal.mean()), "score": 1.0})
+                rows.append({"controller": "optimum", "return": float(np.nanmean(optimal)), "score": 1.0})
             arguments_shown = f" with {kwargs_text}" if env_kwargs else ""
             print(f"\n{env_id}{arguments_shown}, {len(seeds)} episodes")
             print(evaluation.format_summary(rows))
@@ -168,8 +175,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 options.csv
             )
         if options.episodes_csv is not None:
-            import numpy as np
-
             columns: dict[str, Any] = {
                 "env_id": [env_id for env_id, _, table in all_episodes for _ in range(table.n_rows)],
                 "controller": [name for _, name, table in all_episodes for _ in range(table.n_rows)],

@@ -26,11 +26,12 @@ from sd_friction_env.parameters import checked_number
 from sd_friction_env.tables import atomic_file
 
 Actions = NDArray[np.float32]
-State = tuple[NDArray[np.float32], ...] | None
+State = tuple[NDArray[Any], ...] | None
 
 NETWORK_FORMAT = 1
 _NETWORK_KIND = "sd_friction_env network policy"
 _LARGEST_GAIN = 1e6
+_GAINS = (-_LARGEST_GAIN, _LARGEST_GAIN)
 
 _ACTIVATIONS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
     "Tanh": np.tanh,
@@ -259,6 +260,158 @@ class VelocityFeedback:
         sign = -1.0 if self.readings.actuator == "force" else 1.0
         action = (sign * self.gain / self.readings.authority) * self.readings.read(observation)[..., 1]
         return np.clip(action, -1.0, 1.0).astype(np.float32)[..., None], None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilteredFeedback:
+    """Saturated linear feedback of the position and of a velocity estimated from it, for sensors that see x alone.
+
+    The estimate is the difference of two readings over the control interval, smoothed by a first-order filter:
+    w <- pole w + (1 - pole) (x - x_before)/control_interval; action = x_gain (x - x_equilibrium) + v_gain w, clipped
+    to [-amplitude, amplitude]. With a large ``v_gain`` it is a sliding mode with a boundary layer.
+
+    Attributes:
+        x_gain, v_gain: action per unit, in [-1e6, 1e6].
+        pole: of the filter, in [0, 1); 0: no smoothing.
+        amplitude: largest action, in [0, 1].
+        control_interval: time between two readings.
+        readings: of the environment to be controlled.
+
+    Raises:
+        TypeError, ValueError: if one is not such a number.
+    """
+
+    x_gain: float
+    v_gain: float
+    pole: float
+    control_interval: float
+    readings: Readings
+    amplitude: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_numbers(self, {"x_gain": _GAINS, "v_gain": _GAINS, "pole": (0.0, 0.999), "amplitude": (0.0, 1.0)})
+
+    @classmethod
+    def from_env(cls, env: Any, **parameters: float) -> Self:
+        """Return the controller of an environment; see :class:`Readings`."""
+        readings = Readings.from_env(env)
+        return cls(control_interval=env.unwrapped.task.control_interval, readings=readings, **parameters)
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, State]:
+        """Return the saturated feedback; it remembers the last position and the estimate; see the module."""
+        x = self.readings.read(observation)[..., 0]
+        before, estimate = (x, np.zeros_like(x)) if state is None else state
+        starts = _starts(episode_start, x)
+        before, estimate = np.where(starts, x, before), np.where(starts, 0.0, estimate)
+        estimate = self.pole * estimate + (1.0 - self.pole) * (x - before) / self.control_interval
+        action = np.clip(self.x_gain * x + self.v_gain * estimate, -self.amplitude, self.amplitude)
+        return action.astype(np.float32)[..., None], (x, estimate)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelayedFeedback:
+    """Delayed displacement feedback: action = gain (x(t - delay) - x(t)), clipped to [-1, 1].
+
+    Source: K. Pyragas, Phys. Lett. A 170 (1992) 421; J. Das and A. K. Mallik, J. Sound Vib. 297 (2006) 578, for
+    friction-driven vibration. Until the first delay has passed, it compares with the first reading.
+
+    Attributes:
+        gain: action per unit of displacement, in [-1e6, 1e6].
+        delay: in control intervals, in [1, 1000].
+        readings: of the environment to be controlled.
+
+    Raises:
+        TypeError, ValueError: if one is not such a number.
+    """
+
+    gain: float
+    delay: int
+    readings: Readings
+
+    def __post_init__(self) -> None:
+        _check_numbers(self, {"gain": _GAINS, "delay": (1.0, 1000.0)})
+        if self.delay != int(self.delay):
+            raise ValueError(f"delay must be a whole number, got {self.delay!r}")
+        object.__setattr__(self, "delay", int(self.delay))
+
+    @classmethod
+    def from_env(cls, env: Any, gain: float, delay: int) -> Self:
+        """Return the controller of an environment; see :class:`Readings`."""
+        return cls(gain=gain, delay=delay, readings=Readings.from_env(env))
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, State]:
+        """Return the saturated feedback; it remembers the positions within the delay; see the module."""
+        x = self.readings.read(observation)[..., 0]
+        first = np.repeat(x[..., None], self.delay, axis=-1)
+        past = first if state is None else np.where(_starts(episode_start, x)[..., None], first, state[0])
+        action = np.clip(self.gain * (past[..., 0] - x), -1.0, 1.0)
+        return action.astype(np.float32)[..., None], (np.concatenate([past[..., 1:], x[..., None]], axis=-1),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlidingMode:
+    """Sliding mode with a boundary layer: action = -amplitude sat((v + slope (x - x_equilibrium))/layer).
+
+    Source: J.-J. E. Slotine and W. Li, Applied Nonlinear Control (1991), section 7.2.
+
+    Attributes:
+        slope: of the sliding line in the phase plane, in [-1e6, 1e6].
+        layer: half its width in velocity, in [1e-6, 1e6].
+        amplitude: largest action, in [-1, 1]; negative: the other way, for a belt that is to follow the mass.
+        readings: of the environment to be controlled.
+
+    Raises:
+        TypeError, ValueError: if one is not such a number, or the velocity is not observed.
+    """
+
+    slope: float
+    layer: float
+    readings: Readings
+    amplitude: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_numbers(self, {"slope": _GAINS, "layer": (1e-6, 1e6), "amplitude": (-1.0, 1.0)})
+        if not self.readings.sees_velocity:
+            raise ValueError("a sliding mode needs the velocity, and this environment's sensor sees the position only")
+
+    @classmethod
+    def from_env(cls, env: Any, **parameters: float) -> Self:
+        """Return the controller of an environment; see :class:`Readings`."""
+        return cls(readings=Readings.from_env(env), **parameters)
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, State]:
+        """Return the saturated feedback; see the module."""
+        values = self.readings.read(observation)
+        surface = values[..., 1] + self.slope * values[..., 0]
+        action = -self.amplitude * np.clip(surface / self.layer, -1.0, 1.0)
+        return action.astype(np.float32)[..., None], None
+
+
+def _check_numbers(controller: Any, ranges: Mapping[str, tuple[float, float]]) -> None:
+    for name, (low, high) in ranges.items():
+        object.__setattr__(controller, name, checked_number(name, getattr(controller, name), low, high))
+
+
+def _starts(episode_start: ArrayLike | None, like: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.broadcast_to(np.asarray(False if episode_start is None else episode_start, dtype=bool), like.shape)
 
 
 # Networks -------------------------------------------------------------------------------------------------------------

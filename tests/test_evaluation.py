@@ -1,14 +1,16 @@
 """The yardsticks: metrics of episodes with known answers, and the score."""
 
 import dataclasses
+import itertools
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
-from agents import evaluation
+from agents import classical, evaluation
 from agents.evaluation import Episodes, evaluate, metrics, run_episodes, score, summarise
 from scripts import evaluate as script
 from sd_friction_env import OscillatorParameters, Table, limit_cycle
@@ -132,10 +134,81 @@ def test_the_score_is_a_ratio_of_means():
     assert score([-50.0, -100.0], [-100.0, -200.0], [-50.0, 0.0]) == pytest.approx(75.0 / 125.0)
     assert score([1.0], [1.0], [2.0]) == 0.0
     assert score([2.0], [1.0], [2.0]) == 1.0
+    # an episode whose optimum nobody knows does not count
+    assert score([-50.0, -9.0], [-100.0, -1.0], [-50.0, np.nan]) == 1.0
     with pytest.raises(ValueError, match="same episodes"):
         score([1.0, 2.0], [1.0], [1.0])
+    with pytest.raises(ValueError, match="same episodes"):
+        score([1.0], [0.0], [np.nan])
     with pytest.raises(ValueError, match="better than passive"):
         score([1.0], [1.0], [1.0])
+
+
+def test_the_interval_of_a_score_is_the_paired_bootstrap():
+    rng = np.random.default_rng(1)
+    passive = rng.normal(-500.0, 30.0, 60)
+    optimal = -40.0 + 0.2 * (passive + 500.0)
+    returns = optimal - rng.gamma(2.0, 20.0, 60)
+    low, high = evaluation.score_interval(returns, passive, optimal, resamples=20_000)
+
+    def statistic(mine, without, best, axis):
+        base = without.mean(axis=axis)
+        return (mine.mean(axis=axis) - base) / (best.mean(axis=axis) - base)
+
+    oracle = scipy.stats.bootstrap(
+        (returns, passive, optimal), statistic, paired=True, method="percentile", n_resamples=20_000
+    ).confidence_interval
+    assert (low, high) == pytest.approx((oracle.low, oracle.high), abs=0.03 * (high - low))
+    assert low < score(returns, passive, optimal) < high
+    assert evaluation.score_interval(returns, passive, optimal, seed=3) == evaluation.score_interval(
+        returns, passive, optimal, seed=3
+    )
+    # what is always halfway is so in every resample; one episode tells nothing of the next
+    assert evaluation.score_interval(0.5 * (passive + optimal), passive, optimal) == pytest.approx((0.5, 0.5))
+    assert np.isnan(evaluation.score_interval([2.0], [1.0], [3.0])).all()
+
+
+def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
+    assert evaluation.interquartile_mean([-100.0, 1.0, 2.0, 3.0, 1000.0]) == 2.0
+    assert evaluation.interquartile_mean(np.array([[0.0, 1.0], [5.0, 90.0]])) == 3.0
+    assert evaluation.interquartile_mean([4.0, 8.0]) == 6.0
+
+
+def test_the_interval_over_runs_is_the_bootstrap_over_all_resamples():
+    runs = [0.1, 0.5, 0.6]
+    every = [np.mean(drawn) for drawn in itertools.product(runs, repeat=3)]  # of three, none is cut off
+    low, high = evaluation.run_interval([runs], resamples=40_000)
+    for end, share in ((low, 0.025), (high, 0.975)):
+        assert end == pytest.approx(np.quantile(every, share, method="inverted_cdf"))
+    assert np.isnan(evaluation.run_interval([[0.3]])).all()
+    with pytest.raises(ValueError, match="scores must be"):
+        evaluation.run_interval([[0.3], []])
+
+
+def test_runs_are_resampled_within_their_task():
+    # Were they mixed, the share of ones would vary between resamples.
+    assert evaluation.run_interval([[0.0] * 4, [1.0] * 4]) == (0.5, 0.5)
+    assert evaluation.run_interval([[0.0, 1.0] * 4]) != (0.5, 0.5)
+
+
+def test_the_interval_of_a_share_is_wilsons():
+    z = scipy.stats.norm.ppf(0.975)
+    hits, n = 7, 20
+    centre, half = (hits + z * z / 2) / (n + z * z), z / (n + z * z) * np.sqrt(hits * (n - hits) / n + z * z / 4)
+    assert evaluation.share_interval(hits, n) == pytest.approx((centre - half, centre + half))
+    assert evaluation.share_interval(100, 100)[0] == pytest.approx(100 / (100 + z * z))
+
+
+def test_each_episode_may_have_parameters_of_its_own():
+    speeds = [0.1, 0.2, 0.3]
+    options = {"parameters": {"belt_speed": np.array(speeds)}}
+    episodes = run_episodes(ZeroPolicy(), FORCE, [1, 2, 3], options=options)
+    table = metrics(episodes, episodes)
+    cycles = [limit_cycle(OscillatorParameters(belt_speed=speed)).amplitude for speed in speeds]
+    assert table["amplitude"] == pytest.approx(cycles, rel=1e-6)
+    assert episodes.belt_speed.tolist() == speeds
+    with pytest.raises(ValueError, match="unknown option 'wind'"):
+        run_episodes(ZeroPolicy(), FORCE, [1], options={"wind": 1.0})
 
 
 def test_the_passive_oscillator_is_the_limit_cycle():
@@ -196,8 +269,12 @@ def test_foreign_environments_and_missing_seeds_are_refused():
 def test_no_optimum_is_claimed_where_none_is_known():
     seeds = evaluation.EVALUATION_SEEDS
     assert evaluation.optimal_returns(FORCE, seeds, {"w_effort": 0.2}) is None
-    assert evaluation.optimal_returns("SDFriction/ForceSensed-v0", seeds) is None
+    assert evaluation.optimal_returns("SDFriction/ForceSensed-v0", [3]) is None
     assert evaluation.optimal_returns(FORCE, [3]) is None
+    some = evaluation.optimal_returns(FORCE, [3, seeds[7]])
+    assert some is not None
+    assert np.isnan(some[0])
+    assert some[1] == evaluation.optimal_returns(FORCE, seeds)[7]
     table = evaluate(ZeroPolicy(), FORCE, [3], {"episode_steps": 20})
     assert np.isnan(summarise("x", table, table, None)["score"])
     assert summarise("x", table, table, table["return"] + 1.0)["score"] == 0.0
@@ -252,6 +329,22 @@ def test_the_script_refuses_bad_arguments_in_one_line(tmp_path, capsys):
         assert stop.value.code == 2, command
         assert message in error
         assert error.count("\n") == 1
+
+
+def test_the_script_names_all_tuned_classical_controllers(tmp_path, monkeypatch, capsys):
+    command = ["--task", "force", "--episodes", "2", "--controller", "classical"]
+    made = {f"made for {FORCE}": ConstantPolicy(0.5)}
+    monkeypatch.setattr(classical, "classical_controllers", {FORCE: made}.__getitem__)
+    assert script.main(command) == 0
+    assert f"made for {FORCE}" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        script.main([*command, "--env-arg", "w_effort=0.2"])
+    assert "leave one of them out" in capsys.readouterr().err
+    monkeypatch.undo()
+    monkeypatch.setattr(classical, "GAINS_FILE", tmp_path / "none.json")
+    with pytest.raises(SystemExit):
+        script.main(command)
+    assert "no tuned controllers are stored" in capsys.readouterr().err
 
 
 def test_the_script_runs_as_a_program():

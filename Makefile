@@ -23,7 +23,7 @@ PIP := -m pip --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint format slow reference benchmark benchmark-peers figures constraints clean
+.PHONY: help setup demo test lint format slow reference benchmark benchmark-peers figures report constraints clean
 
 help: ## list the targets
 	@echo "Usage: make TARGET [ARGS=...] [PYTHON=python3.12] [TORCH_INDEX=https://download.pytorch.org/whl/cpu]"
@@ -84,6 +84,9 @@ benchmark-peers: ## make .venv-peers with EnvPool and gymnax: `make benchmark` t
 
 figures: setup ## compute and draw the paper's figures again
 	for name in 2 3 4 5 basins linear; do "$(RUN)" scripts/figure_$$name.py || exit 1; done
+
+report: setup ## evaluate every controller on every task; write report_output/report.html (a minute)
+	"$(RUN)" scripts/report.py $(ARGS)
 
 # The newest versions that the ranges in pyproject.toml allow, installed on their own and frozen.
 constraints: ## renew constraints.txt from the newest versions (then run make test)

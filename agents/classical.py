@@ -232,12 +232,16 @@ def versions() -> dict[str, str]:
     return {"sd_friction_env": sd_friction_env.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
 
 
-def stored_gains(path: Path = GAINS_FILE) -> dict[str, dict[str, Any]]:
+def stored_gains(path: Path | None = None) -> dict[str, dict[str, Any]]:
     """Return what is stored: by environment id and controller, what :func:`tune` returned and the command.
+
+    Args:
+        path: of the file; None: the one that comes with the project.
 
     Raises:
         ValueError: if the file is not one of ours.
     """
+    path = GAINS_FILE if path is None else path
     if not path.exists():
         return {}
     try:
@@ -254,9 +258,9 @@ def stored_gains(path: Path = GAINS_FILE) -> dict[str, dict[str, Any]]:
     return gains
 
 
-def store(gains: Mapping[str, Any], path: Path = GAINS_FILE) -> None:
+def store(gains: Mapping[str, Any], path: Path | None = None) -> None:
     """Write gains, whole or not at all."""
-    with atomic_file(path) as file:
+    with atomic_file(GAINS_FILE if path is None else path) as file:
         json.dump({"versions": versions(), "gains": gains}, file, indent=1)
         file.write("\n")
 
@@ -265,13 +269,13 @@ def classical_controllers(env_id: str, path: Path | None = None) -> dict[str, Po
     """Return the tuned controllers of an environment by name.
 
     Args:
-        env_id: its id. path: of the gains; None: those that come with the project.
+        env_id: its id. path: of the gains, as :func:`stored_gains` takes it.
 
     Raises:
         ValueError: if none is stored for it, or the file is not one of ours.
     """
     env_id = env_id.rpartition(":")[2]
-    found = stored_gains(GAINS_FILE if path is None else path).get(env_id)
+    found = stored_gains(path).get(env_id)
     if not found:
         raise ValueError(f"no tuned controllers are stored for {env_id!r}: run scripts/tune_classical.py")
     return {name: build(name, env_id, list(entry["values"].values())) for name, entry in found.items()}

@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out f
         stick_intervals,
     )
     from sd_friction_env.parameters import OscillatorParameters
+    from sd_friction_env.pretrained import load_pretrained
     from sd_friction_env.simulation import Trajectory, simulate
     from sd_friction_env.tables import Table
     from sd_friction_env.task import Task
@@ -58,6 +59,7 @@ _PUBLIC = {
     "SDFrictionEnv": "env",
     "EnvState": "env",
     "SDFrictionVectorEnv": "vector_env",
+    "load_pretrained": "pretrained",
 }
 __all__ = [
     "ENVIRONMENT_IDS",
@@ -83,6 +85,7 @@ __all__ = [
     "equilibria",
     "first_lyapunov_coefficient",
     "limit_cycle",
+    "load_pretrained",
     "simulate",
     "slip_cycles",
     "stick_intervals",

@@ -1,10 +1,11 @@
-"""The command line: passive analysis without writing code. ``python -m sd_friction_env --help`` lists the commands."""
+"""The command line: analysis, videos and checks without writing code. ``python -m sd_friction_env --help`` lists it."""
 
 import argparse
 import dataclasses
 import itertools
 import json
 import math
+import os
 import re
 import shlex
 import sys
@@ -13,14 +14,19 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+import gymnasium as gym
 import numpy as np
 
 import sd_friction_env
 from sd_friction_env import plotting
 from sd_friction_env.basins import LOST_CONTACT, UNDECIDED, basin_grid
 from sd_friction_env.curves import amplitude_curve, attractor_curves, checked_belt_speeds
+from sd_friction_env.doctor import as_text, examine, hyperparameter_folder
 from sd_friction_env.orbits import OrbitError, critical_belt_speeds, first_lyapunov_coefficient, limit_cycle
 from sd_friction_env.parameters import GEOMETRIES, RANGES, OscillatorParameters
+from sd_friction_env.policies import Policy, VelocityFeedback, ZeroPolicy, load_policy
+from sd_friction_env.pretrained import load_pretrained
+from sd_friction_env.rendering import checked_size
 from sd_friction_env.simulation import simulate
 from sd_friction_env.startup import announced
 from sd_friction_env.tables import Table, atomic_file
@@ -37,6 +43,9 @@ _FIELDS = {
     "belt_speed": "belt speed v_b",
 }
 _MOST_POINTS = 10_000_000
+_TASKS = {"force": "Force", "belt": "BeltSpeed"}
+_TIERS = {"nominal": "", "randomised": "Randomised", "sensed": "Sensed"}
+_VELOCITY_GAIN = 1.5
 
 
 class UsageError(ValueError):
@@ -78,7 +87,7 @@ class _Parser(argparse.ArgumentParser):
         raise SystemExit(BAD_USAGE)
 
 
-def _command(
+def _bare_command(
     commands: Any, name: str, run: Callable[[argparse.Namespace], int], summary: str, examples: Sequence[str]
 ) -> argparse.ArgumentParser:
     lines = "\n".join(f"  sd-friction {name} {example}" for example in examples)
@@ -89,7 +98,15 @@ def _command(
         epilog=f"examples:\n{lines}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, analysis=False)
+    return parser
+
+
+def _command(
+    commands: Any, name: str, run: Callable[[argparse.Namespace], int], summary: str, examples: Sequence[str]
+) -> argparse.ArgumentParser:
+    parser = _bare_command(commands, name, run, summary, examples)
+    parser.set_defaults(analysis=True)
     group = parser.add_argument_group("oscillator", "one or more values each, or start:stop:step; several make a grid")
     group.add_argument("--geometry", nargs="+", choices=GEOMETRIES, default=["exact"], help="forces (default: exact)")
     nominal = OscillatorParameters()
@@ -119,7 +136,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the whole program."""
     program = _Parser(
         prog="sd-friction",
-        description="Passive analysis of the self-excited SD oscillator on a moving belt.",
+        description="The self-excited SD oscillator on a moving belt: passive analysis, control, pictures.",
         epilog="each command has its own help with examples: sd-friction amplitude --help",
     )
     program.add_argument("--version", action="version", version=f"sd_friction_env {sd_friction_env.__version__}")
@@ -183,6 +200,64 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--v", nargs=2, type=float, default=[-1.0, 1.0], metavar=("LOW", "HIGH"), help="starts in v")
     command.add_argument("--shape", nargs=2, type=int, default=[400, 400], metavar=("N", "M"), help="grid (400 400)")
     _add_output(command, "the basins")
+
+    command = _bare_command(
+        commands,
+        "video",
+        _video,
+        "a video of an episode, without control and with it side by side",
+        [
+            "--task belt --out suppressed.mp4",
+            "--task force --agent velocity-feedback --gain 1.5 --size 480 270 --every 3 --fps 10 --out small.gif",
+            "--task belt --tier sensed --agent runs/mine/policy.npz --seed 3 --alone --out mine.mp4",
+        ],
+    )
+    command.add_argument("--task", choices=_TASKS, required=True, help="actuator: a force, or the belt's speed")
+    command.add_argument("--tier", choices=_TIERS, default="nominal", help="what is hidden (default: nominal)")
+    command.add_argument(
+        "--agent",
+        default="pretrained",
+        metavar="AGENT",
+        help="pretrained (default), velocity-feedback, none, or a trained agent's policy.npz",
+    )
+    command.add_argument("--gain", type=float, help="of velocity-feedback (default: 1.5)")
+    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.mp4 or FILE.gif")
+    command.add_argument("--seed", type=int, default=0, help="of the episode (default: 0)")
+    command.add_argument("--steps", type=int, default=300, help="control intervals (default: 300)")
+    command.add_argument(
+        "--size", nargs=2, type=int, default=[960, 540], metavar=("WIDTH", "HEIGHT"), help="of one picture, in pixels"
+    )
+    command.add_argument("--every", type=int, default=1, metavar="N", help="a frame every N intervals (default: 1)")
+    command.add_argument("--fps", type=int, default=30, help="frames a second, 1 to 60 (GIF: to 50; default: 30)")
+    command.add_argument("--alone", action="store_true", help="without the passive oscillator beside it")
+
+    command = _bare_command(
+        commands,
+        "hyperparameters",
+        _hyperparameters,
+        "where the tuned hyperparameters are, in RL Zoo's format",
+        ["", "ppo", "ppo --show"],
+    )
+    command.add_argument("algorithm", nargs="?", help="such as ppo (default: the folder of all)")
+    command.add_argument("--show", action="store_true", help="print the file itself")
+
+    command = _bare_command(
+        commands,
+        "doctor",
+        _doctor,
+        "versions, caches, threads, and what is missing for which feature",
+        ["", "--json"],
+    )
+    command.add_argument("--json", action="store_true", help="print JSON")
+
+    command = _bare_command(
+        commands,
+        "completion",
+        _completion,
+        "a script that makes a shell complete commands and options",
+        ["bash > ~/.local/share/bash-completion/completions/sd-friction", "zsh > ~/.zfunc/_sd-friction"],
+    )
+    command.add_argument("shell", choices=("bash", "zsh", "tcsh"))
     return program
 
 
@@ -384,16 +459,102 @@ def _basins(options: argparse.Namespace) -> int:
     return 0
 
 
+def _video(options: argparse.Namespace) -> int:
+    from sd_friction_env import video
+
+    for name, low, high in (("steps", 1, video.MOST_STEPS), ("every", 1, video.MOST_STEPS), ("fps", 1, 60)):
+        if not low <= getattr(options, name) <= high:
+            raise UsageError(f"--{name} must be in [{low}, {high}], got {getattr(options, name)}")
+    if options.seed < 0:
+        raise UsageError(f"--seed must be at least 0, got {options.seed}")
+    video.check_video_path(options.out, options.fps)
+    checked_size(options.size)
+    env_id = f"SDFriction/{_TASKS[options.task]}{_TIERS[options.tier]}-v0"
+    policy, title = _agent(options, env_id)
+    pictures = video.frames(
+        env_id,
+        policy,
+        seed=options.seed,
+        steps=options.steps,
+        size=tuple(options.size),
+        every=options.every,
+        side_by_side=not options.alone,
+        title=title,
+    )
+    show = _progress(options.steps // options.every + 1, "frames")
+    video.write_video(options.out, pictures, fps=options.fps, progress=show)
+    return 0
+
+
+def _agent(options: argparse.Namespace, env_id: str) -> tuple[Policy, str]:
+    """Return the controller that --agent names, and what to call it."""
+    if options.gain is not None and options.agent != "velocity-feedback":
+        raise UsageError(f"--gain goes with --agent velocity-feedback, not with {options.agent!r}")
+    if options.agent == "none":
+        return ZeroPolicy(), "no control"
+    if options.agent == "pretrained":
+        policy = load_pretrained(env_id)
+        return policy, f"{policy.metadata['algorithm'].upper()} agent"
+    env = gym.make(env_id)
+    if options.agent == "velocity-feedback":
+        gain = _VELOCITY_GAIN if options.gain is None else options.gain
+        return VelocityFeedback.from_env(env, gain), "velocity feedback"
+    if not options.agent.endswith(".npz"):
+        known = "pretrained, velocity-feedback, none or a policy.npz"
+        raise UsageError(f"--agent must be {known}, got {options.agent!r}")
+    try:
+        network = load_policy(options.agent)
+    except OSError as error:
+        raise UsageError(f"--agent {options.agent!r} cannot be read: {error}") from None
+    (size,) = env.observation_space.shape or (0,)
+    if network.observation_size != size:
+        raise UsageError(f"{options.agent!r} observes {network.observation_size} values, and {env_id} gives {size}")
+    return network, str(network.metadata.get("algorithm", "controlled"))
+
+
+def _hyperparameters(options: argparse.Namespace) -> int:
+    folder = hyperparameter_folder()
+    known = sorted(file.stem for file in folder.glob("*.yml"))
+    if options.algorithm is None:
+        print(folder)
+        return 0
+    if options.algorithm not in known:
+        raise UsageError(f"algorithm must be one of {', '.join(known)}, got {options.algorithm!r}")
+    file = folder / f"{options.algorithm}.yml"
+    print(file.read_text(encoding="utf-8").rstrip() if options.show else file)
+    return 0
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    findings = examine()
+    print(json.dumps(findings, indent=1) if options.json else as_text(findings, colour=_coloured()))
+    return 0 if findings["works"] else FAILURE
+
+
+def _coloured() -> bool:
+    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def _completion(options: argparse.Namespace) -> int:
+    try:
+        import shtab
+    except ImportError:
+        raise UsageError('completion needs shtab: pip install "sd-friction-env[completion]"') from None
+    print(shtab.complete(parser(), shell=options.shell))
+    return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit status: 0 done, 1 failed, 2 bad usage, 130 interrupted."""
     typed = list(sys.argv[1:] if arguments is None else arguments)
     options = parser().parse_args(typed)
     options.typed = typed
     try:
-        _check_output(options)
-        with announced("orbits"):
-            # Compiled here, so that progress bars time the work alone.
-            limit_cycle(OscillatorParameters())
+        if options.analysis:
+            _check_output(options)
+            with announced("orbits"):
+                # Compiled here, so that progress bars time the work alone.
+                limit_cycle(OscillatorParameters())
         return int(options.run(options))
     except OrbitError as error:
         print(f"sd-friction: {error}", file=sys.stderr)

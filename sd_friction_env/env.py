@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sd_friction_env import kernel
 from sd_friction_env.orbits import stick_intervals
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_choice, checked_number
+from sd_friction_env.rendering import checked_size
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.startup import announced
 from sd_friction_env.task import FloatArray, IntegerArray, Task, rig_arguments
@@ -127,10 +128,11 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ## Arguments
 
-    `parameters` (an :class:`OscillatorParameters` or a mapping of its fields), `render_mode`, `reward`, and every field
-    of :class:`Task`: `actuator`, `force_limit`, `belt_authority`, `belt_acceleration_limit`, `control_interval`,
-    `episode_steps`, `w_effort`, `w_stick`, `start`, `kick`, `randomise`, `show_parameters`, `sensor`, `sensor_noise`,
-    `sensor_delay`, `contact_loss_cost`, `observation_limit`, `x_offset`, `x_scale`, `v_scale`.
+    `parameters` (an :class:`OscillatorParameters` or a mapping of its fields), `render_mode`, `render_size` (width and
+    height of a frame in pixels), `reward`, and every field of :class:`Task`: `actuator`, `force_limit`,
+    `belt_authority`, `belt_acceleration_limit`, `control_interval`, `episode_steps`, `w_effort`, `w_stick`, `start`,
+    `kick`, `randomise`, `show_parameters`, `sensor`, `sensor_noise`, `sensor_delay`, `contact_loss_cost`,
+    `observation_limit`, `x_offset`, `x_scale`, `v_scale`.
 
     ```python
     import gymnasium as gym
@@ -143,12 +145,14 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}  # noqa: RUF012 (Gymnasium's own form)
+    title = ""  # of the pictures; without one they name the spring
 
     def __init__(
         self,
         parameters: OscillatorParameters | Mapping[str, Any] | None = None,
         *,
         render_mode: str | None = None,
+        render_size: tuple[int, int] = (960, 540),
         reward: RewardFunction | None = None,
         **task_arguments: Any,
     ) -> None:
@@ -165,6 +169,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 corner["mu_m"] = task.randomise["mu_m"][1]  # the greatest, beside the least mu_s
             check_belt(self.nominal.replace(**corner))
         self.render_mode = render_mode
+        self.render_size = checked_size(render_size)
         self.reward = reward
         with announced("orbits"):
             self.task = task.with_scales(self.nominal)
@@ -413,6 +418,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return type(self)(
             self.nominal,
             render_mode=self.render_mode,
+            render_size=self.render_size,
             reward=self.reward,
             **{name: getattr(self.task, name) for name in Task.field_names()},
         )
@@ -425,7 +431,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         from sd_friction_env.rendering import Renderer, Scene
 
         if self._renderer is None:
-            self._renderer = Renderer(self.render_mode, fps=self.metadata["render_fps"])
+            self._renderer = Renderer(self.render_mode, *self.render_size, fps=self.metadata["render_fps"])
         p, task = self._parameters, self.task
         x, v, v_belt, belt_travel = self._state[kernel.S_X : kernel.S_TRAVEL + 1, 0].tolist()
         intervals = stick_intervals(p.replace(belt_speed=v_belt)) if v_belt >= 0.0 else []
@@ -449,6 +455,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 stick_interval=interval,
                 amplitude=amplitude(min(lows), max(highs)),
                 stick_fraction=sum(sticks) / len(sticks),
+                title=self.title,
             )
         )
 

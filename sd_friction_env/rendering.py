@@ -258,6 +258,18 @@ def _require_pygame() -> None:
     pygame.font.init()  # needs no display; does nothing the second time
 
 
+def checked_size(size: Any) -> tuple[int, int]:
+    """Return the size of a frame (width, height) in pixels.
+
+    Raises:
+        TypeError: if it is no pair. ValueError: if one is not a whole number in ``WIDTHS`` or ``HEIGHTS``.
+    """
+    if not isinstance(size, Sequence) or isinstance(size, str) or len(size) != 2:
+        raise TypeError(f"render_size must be a pair (width, height) of whole numbers, got {size!r}")
+    width, height = size
+    return _checked_whole("render_size width", width, WIDTHS), _checked_whole("render_size height", height, HEIGHTS)
+
+
 def _checked_whole(name: str, value: Any, limits: tuple[int, int]) -> int:
     low, high = limits
     try:

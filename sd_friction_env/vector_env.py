@@ -142,6 +142,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     info_keys: "all", or which names of the single environment's info a step tells; "parameters" among them tells the
         parameters of episodes that begin.
     render_mode: "rgb_array" (:meth:`render` returns a tuple of frames) or "human" (a window for one environment).
+    render_size: of a frame, as of :class:`SDFrictionEnv`.
     render_envs: which environments are drawn; None: the first 16 (of "human": the first).
 
     Raises:
@@ -159,6 +160,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         threads: int = 1,
         copy: bool = True,
         render_mode: str | None = None,
+        render_size: tuple[int, int] = (960, 540),
         render_envs: Iterable[int] | None = None,
         reward: RewardFunction | None = None,
         info_keys: Collection[str] | Literal["all"] = REWARD_TERMS,
@@ -177,7 +179,9 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         if not isinstance(copy, bool):
             raise TypeError(f"copy must be True or False, got {copy!r}")
         self.copy = copy
-        self._single = SDFrictionEnv(parameters, render_mode=render_mode, reward=reward, **task_arguments)
+        self._single = SDFrictionEnv(
+            parameters, render_mode=render_mode, render_size=render_size, reward=reward, **task_arguments
+        )
         self.info_keys = checked_info_keys(info_keys)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}

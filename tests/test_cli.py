@@ -4,12 +4,15 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from sd_friction_env import Table, __version__, limit_cycle
+from sd_friction_env import Table, __version__, doctor, limit_cycle, pretrained
 from sd_friction_env.cli import main, numbers
 from sd_friction_env.parameters import OscillatorParameters
+from sd_friction_env.pretrained import pretrained_file
 
 
 def test_the_published_command_writes_a_table_and_a_plot(tmp_path):
@@ -126,3 +129,124 @@ def test_the_module_runs_as_a_program():
         [sys.executable, "-m", "sd_friction_env", "amplitude", "--help"], capture_output=True, text=True, check=True
     ).stdout
     assert "examples:" in text
+
+
+def test_a_video_shows_the_passive_and_the_controlled_oscillator(tmp_path, capsys):
+    imageio = pytest.importorskip("imageio.v3")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    small = ["--steps", "6", "--size", "320", "240", "--every", "2"]
+    for name in ("pair.gif", "pair.mp4"):
+        command = ["video", "--task", "belt", "--agent", "velocity-feedback", "--gain", "0.5"]
+        assert main([*command, "--out", str(tmp_path / name), *small]) == 0
+    pictures = imageio.imread(tmp_path / "pair.gif", index=None)
+    assert pictures.shape == (4, 240, 2 * 320 + 8, 3)
+    left, right = pictures[..., :320, :], pictures[..., -320:, :]
+    first = np.abs(left[0].astype(int) - right[0]).mean()  # the titles differ, and nothing else
+    assert np.abs(left[-1].astype(int) - right[-1]).mean() > first
+    count, seconds = ffmpeg.count_frames_and_secs(str(tmp_path / "pair.mp4"))
+    assert (count, seconds) == (4, pytest.approx(4 / 30, abs=0.01))
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["pair.gif", "pair.mp4"]
+    alone = tmp_path / "alone.gif"
+    assert main(["video", "--task", "force", "--agent", "none", "--alone", "--out", str(alone), *small]) == 0
+    assert imageio.imread(alone, index=None).shape == (4, 240, 320, 3)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_video_shows_any_agent_that_fits(tmp_path, capsys):
+    pytest.importorskip("imageio.v3")
+    out, small = str(tmp_path / "out.gif"), ["--steps", "1", "--size", "320", "240"]
+    agent = str(pretrained_file("SDFriction/ForceSensed-v0"))
+    assert main(["video", "--task", "force", "--tier", "sensed", "--out", out, *small]) == 0
+    assert main(["video", "--task", "force", "--tier", "sensed", "--agent", agent, "--out", out, *small]) == 0
+    assert main(["video", "--task", "force", "--agent", agent, "--out", out, *small]) == 2
+    assert "observes 1 values, and SDFriction/Force-v0 gives 2" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--task force --out film.avi", "must end in .gif or .mp4"),
+        ("--task force --out nowhere/film.gif", "in a folder that exists"),
+        ("--task force --out film.gif --steps 0", "--steps must be in [1, 100000], got 0"),
+        ("--task force --out film.gif --fps 61", "--fps must be in [1, 60], got 61"),
+        ("--task force --out film.gif --fps 51", "fps must be in [1, 50] for a GIF, got 51"),
+        ("--task force --out film.gif --size 10 10", "render_size width must be"),
+        ("--task force --out film.gif --seed -1", "--seed must be at least 0, got -1"),
+        ("--task force --out film.gif --agent someone", "or a policy.npz, got 'someone'"),
+        ("--task force --out film.gif --agent none.npz", "none.npz"),
+        ("--task force --out film.gif --gain 2", "--gain goes with --agent velocity-feedback"),
+        ("--task force --tier sensed --agent velocity-feedback --out film.gif", "sees the position only"),
+        ("--task rope --out film.gif", "invalid choice: 'rope'"),
+        ("--task force", "required: --out"),
+    ],
+)
+def test_a_video_that_cannot_be_is_refused_at_once(arguments, message, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("imageio.v3")
+    monkeypatch.chdir(tmp_path)
+    try:
+        code = main(["video", *arguments.split()])
+    except SystemExit as leaving:
+        code = leaving.code
+    captured = capsys.readouterr()
+    assert code == 2
+    assert message in captured.err
+    assert len(captured.err.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_hyperparameters_are_where_it_says(capsys):
+    assert main(["hyperparameters", "ppo"]) == 0
+    file = Path(capsys.readouterr().out.strip())
+    assert "SDFriction/Force-v0" in file.read_text()
+    assert main(["hyperparameters"]) == 0
+    assert Path(capsys.readouterr().out.strip()) == file.parent
+    assert main(["hyperparameters", "ppo", "--show"]) == 0
+    assert capsys.readouterr().out.strip() == file.read_text().strip()
+    assert main(["hyperparameters", "magic"]) == 2
+    assert "algorithm must be one of ppo, sac, td3, tqc, got 'magic'" in capsys.readouterr().err
+
+
+def test_the_doctor_finds_what_is_there_and_what_is_missing(monkeypatch, capsys):
+    assert main(["doctor", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["versions"]["sd_friction_env"] == __version__
+    assert found["kernel"]["amplitude"] == limit_cycle(OscillatorParameters()).amplitude
+    assert found["features"]["render"]["missing"] == []
+    assert set(found["agents"].values()) == {""}
+    known = doctor.importlib.metadata.version
+
+    def version(name):
+        if name == "pygame-ce":
+            raise doctor.importlib.metadata.PackageNotFoundError(name)
+        return known(name)
+
+    monkeypatch.setattr(doctor.importlib.metadata, "version", version)
+    monkeypatch.setattr(pretrained, "PRETRAINED", Path("nowhere"))
+    assert main(["doctor"]) == 1
+    text = capsys.readouterr().out
+    assert 'missing pygame-ce: pip install "sd-friction-env[render]"' in text
+    assert "env_id must be one that an agent was trained for" in text
+    assert "\x1b" not in text  # not a terminal
+
+
+def test_completion_is_a_script_for_the_shell(monkeypatch, capsys):
+    pytest.importorskip("shtab")
+    assert main(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    assert "--belt-speed" in script
+    assert subprocess.run(["bash", "-n"], input=script, text=True, check=False).returncode == 0
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert main(["completion", "bash"]) == 2
+    assert 'pip install "sd-friction-env[completion]"' in capsys.readouterr().err
+
+
+def test_every_command_has_help_with_examples(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    listed = capsys.readouterr().out
+    for name in ("amplitude", "cycle", "critical", "simulate", "basins", "video", "doctor", "completion"):
+        assert f"\n    {name} " in listed
+        with pytest.raises(SystemExit) as leaving:
+            main([name, "--help"])
+        assert leaving.value.code == 0
+        assert f"examples:\n  sd-friction {name}" in capsys.readouterr().out

@@ -14,10 +14,13 @@ import pytest
 from sd_friction_env import equilibria
 from sd_friction_env.policies import (
     ConstantPolicy,
+    DelayedFeedback,
+    FilteredFeedback,
     LinearFeedback,
     NetworkPolicy,
     PolicyFileError,
     Readings,
+    SlidingMode,
     VelocityFeedback,
     ZeroPolicy,
     load_policy,
@@ -125,6 +128,83 @@ def test_feedback_that_cannot_be_is_refused():
         Readings.from_env(gym.make("CartPole-v1"))
     with pytest.raises(ValueError, match="at least 2 entries"):
         VelocityFeedback.from_env(make(), 1.0).predict([0.0])
+
+
+def test_a_sliding_mode_pushes_towards_its_line_and_is_linear_within_its_layer():
+    env = make()
+    place = Readings.from_env(env).x_equilibrium
+    policy = SlidingMode.from_env(env, slope=2.0, layer=0.1, amplitude=0.8)
+    # the surface: v + 2 (x - place)
+    for x, v, action in ((0.02, 0.01, -0.4), (0.02, -0.09, 0.4), (0.0, 0.1, -0.8), (0.0, 3.0, -0.8), (-5.0, 0.0, 0.8)):
+        assert policy.predict(observe(env, place + x, v))[0] == pytest.approx(action, abs=1e-6)
+    other_way = SlidingMode.from_env(env, slope=2.0, layer=0.1, amplitude=-0.8)
+    assert other_way.predict(observe(env, place + 0.02, 0.01))[0] == pytest.approx(0.4, abs=1e-6)
+
+
+def test_delayed_feedback_compares_with_the_reading_of_a_delay_ago():
+    env = make()
+    policy = DelayedFeedback.from_env(env, gain=2.0, delay=3)
+    state, places, actions = None, [0.1, 0.2, 0.15, 0.3, 0.5, 0.9], []
+    for t, x in enumerate(places):
+        action, state = policy.predict(observe(env, x, 0.0), state, t == 0)
+        actions.append(float(action[0]))
+    # the first three compare with the first reading
+    expected = [2.0 * (places[max(t - 3, 0)] - x) for t, x in enumerate(places)]
+    assert actions == pytest.approx(np.clip(expected, -1.0, 1.0), abs=1e-6)
+    again, _ = policy.predict(observe(env, 0.7, 0.0), state, True)
+    assert again == 0.0  # a new episode knows nothing of the last one
+
+
+def test_filtered_feedback_estimates_the_velocity():
+    env = make("SDFriction/ForceSensed-v0", control_interval=0.05)
+    place = Readings.from_env(env).x_equilibrium
+    policy = FilteredFeedback.from_env(env, x_gain=0.5, v_gain=-2.0, pole=0.75, amplitude=0.9)
+    state, x, estimate = None, 0.0, 0.0
+    for t, speed in enumerate((0.0, 0.1, 0.1, -0.3, 0.2, 9.0)):
+        x += 0.05 * speed
+        estimate = 0.75 * estimate + 0.25 * speed
+        action, state = policy.predict(observe(env, place + x, 0.0)[:1], state, t == 0)
+        assert action == pytest.approx(max(-0.9, 0.5 * x - 2.0 * estimate), abs=1e-6)
+
+
+@pytest.mark.parametrize("env_id", ["SDFriction/BeltSpeed-v0", "SDFriction/BeltSpeedSensed-v0"])
+def test_controllers_with_memory_act_alike_alone_and_in_batches(env_id):
+    env = make(env_id)
+    policies = [
+        DelayedFeedback.from_env(env, 3.0, 4),
+        FilteredFeedback.from_env(env, x_gain=1.0, v_gain=-3.0, pole=0.6),
+    ]
+    rng = np.random.default_rng(0)
+    observations = rng.normal(scale=0.3, size=(30, 5, env.observation_space.shape[0])).astype(np.float32)
+    begins = rng.random((30, 5)) < 0.1
+    begins[0] = True
+    for policy in policies:
+        state, singles = None, [None] * 5
+        for t in range(30):
+            together, state = policy.predict(observations[t], state, begins[t])
+            for i in range(5):
+                alone, singles[i] = policy.predict(observations[t, i], singles[i], begins[t, i])
+                assert alone.shape == (1,)
+                assert alone.tobytes() == together[i].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("make_policy", "message"),
+    [
+        (lambda env: DelayedFeedback.from_env(env, 1.0, 0), r"delay must be .*\[1, 1000\].* got 0"),
+        (lambda env: DelayedFeedback.from_env(env, 1.0, 2.5), r"delay must be a whole number, got 2.5"),
+        (lambda env: FilteredFeedback.from_env(env, x_gain=0.0, v_gain=0.0, pole=1.0), r"pole must be .* got 1.0"),
+        (lambda env: SlidingMode.from_env(env, slope=1.0, layer=0.0), r"layer must be .* got 0.0"),
+        (lambda env: SlidingMode.from_env(env, slope=1.0, layer=1.0, amplitude=2.0), r"amplitude must be .* got 2.0"),
+        (
+            lambda env: SlidingMode.from_env(make("SDFriction/ForceSensed-v0"), slope=1.0, layer=1.0),
+            "the position only",
+        ),
+    ],
+)
+def test_classical_controllers_refuse_what_cannot_be(make_policy, message):
+    with pytest.raises(ValueError, match=message):
+        make_policy(make())
 
 
 def test_a_network_computes_what_is_written_down():

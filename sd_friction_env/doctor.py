@@ -1,0 +1,146 @@
+"""What is installed here and what is missing for which feature: ``sd-friction doctor``."""
+
+import importlib.metadata
+import os
+import platform
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+
+import sd_friction_env
+from sd_friction_env.orbits import limit_cycle
+from sd_friction_env.parameters import OscillatorParameters
+from sd_friction_env.policies import PolicyFileError
+from sd_friction_env.pretrained import load_pretrained
+
+DISTRIBUTION = "sd-friction-env"
+_FEATURES = {
+    "plot": "figures and data frames",
+    "render": "windows and frames of an environment",
+    "video": "videos",
+    "explore": "the explorer in the browser",
+    "train": "training with Stable-Baselines3",
+    "tune": "tuning with Optuna",
+    "zoo": "training with RL Zoo",
+    "report": "the report",
+    "export": "agents as ONNX",
+    "completion": "completion in the shell",
+}
+_HERE = Path(__file__).parent
+
+
+def hyperparameter_folder() -> Path:
+    """Return where the tuned hyperparameters are: beside the package if it is installed, else in the repository."""
+    installed = _HERE / "hyperparameters"
+    return installed if installed.is_dir() else _HERE.parent / "agents" / "hyperparameters"
+
+
+def examine() -> dict[str, Any]:
+    """Return what there is, as JSON values.
+
+    ``versions``, ``kernel`` (a limit cycle computed now), ``cache`` of compiled code, ``threads``, ``features`` (by
+    extra: what it is for, what is missing), ``agents`` (by environment, "" or what is wrong), ``hyperparameters``, and
+    ``works``: whether all that is needed without extras does.
+    """
+    begun = time.perf_counter()
+    amplitude = limit_cycle(OscillatorParameters()).amplitude
+    first = time.perf_counter() - begun
+    begun = time.perf_counter()
+    limit_cycle(OscillatorParameters())
+    again = time.perf_counter() - begun
+    agents = {env_id: _agent_fault(env_id) for env_id in sd_friction_env.ENVIRONMENT_IDS}
+    cache = _cache()
+    return {
+        "versions": {
+            "sd_friction_env": sd_friction_env.__version__,
+            "python": platform.python_version(),
+            "system": f"{platform.system()} {platform.machine()}",
+            **{name: _version(name) for name in ("gymnasium", "numpy", "scipy", "numba")},
+        },
+        "kernel": {"amplitude": amplitude, "first_call_seconds": round(first, 3), "seconds": round(again, 6)},
+        "cache": cache,
+        "threads": {"cores": os.cpu_count(), "numba": numba.get_num_threads()},
+        "features": _features(),
+        "agents": agents,
+        "hyperparameters": str(hyperparameter_folder()),
+        "works": bool(np.isfinite(amplitude)) and not any(agents.values()),
+    }
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _agent_fault(env_id: str) -> str:
+    try:
+        load_pretrained(env_id)
+    except (PolicyFileError, ValueError) as error:
+        return str(error)
+    return ""
+
+
+def _cache() -> dict[str, Any]:
+    """Return where numba keeps what it compiled of ours."""
+    folder = Path(os.environ["NUMBA_CACHE_DIR"]) if os.environ.get("NUMBA_CACHE_DIR") else _HERE / "__pycache__"
+    files = list(folder.rglob("kernel.*.nb[ic]"))
+    return {
+        "folder": str(folder),
+        "files": len(files),
+        "megabytes": round(sum(file.stat().st_size for file in files) / 1e6, 1),
+        "writable": os.access(folder, os.W_OK),
+    }
+
+
+def _features() -> dict[str, dict[str, Any]]:
+    """Return what each extra is for, and which of its distributions are not installed."""
+    try:
+        required = importlib.metadata.requires(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:  # run from its source without being installed
+        return {}
+    found: dict[str, dict[str, Any]] = {}
+    for line in required:
+        extra = re.search(r"extra *== *['\"]([\w-]+)['\"]", line)
+        name = re.match(r"[\w.-]+", line)
+        if extra is None or name is None or extra[1] not in _FEATURES:
+            continue
+        feature = found.setdefault(extra[1], {"for": _FEATURES[extra[1]], "missing": []})
+        if _version(name[0]) is None:
+            feature["missing"].append(name[0])
+    return {name: found[name] for name in _FEATURES if name in found}
+
+
+def as_text(findings: dict[str, Any], *, colour: bool = False) -> str:
+    """Return findings of :func:`examine` as lines for people."""
+
+    def mark(good: bool, text: str) -> str:
+        return f"\x1b[{32 if good else 33}m{text}\x1b[0m" if colour else text
+
+    kernel, cache, threads = (findings[part] for part in ("kernel", "cache", "threads"))
+    took = f"{1e3 * kernel['seconds']:.2f} ms (first call {kernel['first_call_seconds']:.2f} s)"
+    lines = [f"{name:16} {version}" for name, version in findings["versions"].items()]
+    lines += [
+        f"{'kernel':16} limit cycle of amplitude {kernel['amplitude']:.10f} in {took}",
+        f"{'compiled code':16} {cache['files']} files, {cache['megabytes']} MB, in {cache['folder']}",
+    ]
+    if not cache["writable"]:
+        lines.append(mark(False, f"{'':16} not writable: every process compiles anew; set NUMBA_CACHE_DIR"))
+    lines += [
+        f"{'threads':16} {threads['cores']} cores, numba uses up to {threads['numba']}",
+        f"{'hyperparameters':16} {findings['hyperparameters']}",
+        "",
+    ]
+    for name, feature in findings["features"].items():
+        missing = feature["missing"]
+        mend = f'missing {", ".join(missing)}: pip install "{DISTRIBUTION}[{name}]"'
+        lines.append(f"{name:16} {feature['for']}: {mark(not missing, 'ready' if not missing else mend)}")
+    lines.append("")
+    for env_id, fault in findings["agents"].items():
+        lines.append(f"agent of {env_id:36} {mark(not fault, fault or 'ready')}")
+    return "\n".join(lines)

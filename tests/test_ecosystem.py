@@ -1,4 +1,4 @@
-"""Our environments with what people already use: Gymnasium's wrappers, Minari. (RL Zoo: test_training.py, TensorBoard: there too.)"""
+"""Our environments with Gymnasium's wrappers and Minari. (RL Zoo and TensorBoard: test_training.py.)"""
 
 import gymnasium as gym
 import numpy as np

@@ -23,7 +23,7 @@ PIP := -m pip --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint format slow reference benchmark benchmark-peers figures report constraints clean
+.PHONY: help setup demo test lint format slow reference benchmark benchmark-peers figures report docs constraints clean
 
 help: ## list the targets
 	@echo "Usage: make TARGET [ARGS=...] [PYTHON=python3.12] [TORCH_INDEX=https://download.pytorch.org/whl/cpu]"
@@ -88,6 +88,10 @@ figures: setup ## compute and draw the paper's figures again
 report: setup ## evaluate every controller on every task; write report_output/report.html (a minute)
 	"$(RUN)" scripts/report.py $(ARGS)
 
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: setup ## build the documentation into site/ (open site/index.html)
+	"$(RUN)" -m mkdocs build --strict $(ARGS)
+
 # The newest versions that the ranges in pyproject.toml allow, installed on their own and frozen.
 constraints: ## renew constraints.txt from the newest versions (then run make test)
 	"$(PYTHON)" -m venv --clear .venv-newest
@@ -99,6 +103,6 @@ constraints: ## renew constraints.txt from the newest versions (then run make te
 	rm -rf .venv-newest
 
 clean: ## remove .venv and its like, caches, builds and the demo's output (trained runs stay)
-	rm -rf "$(VENV)" .venv-newest .venv-peers build dist demo_output *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf "$(VENV)" .venv-newest .venv-peers build dist demo_output report_output site *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	rm -rf .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,4 +1,4 @@
-"""Optimal control of the nominal tasks: the score-1 yardstick, computed on the environment's own step.
+"""Optimal control: the score-1 yardstick, computed on the environment's own step.
 
 An optimum is found in three stages, over the whole episode and without discount:
 
@@ -10,34 +10,51 @@ An optimum is found in three stages, over the whole episode and without discount
 Every number of the reference is the return of an action sequence that the environment really takes, hence a lower
 bound on the true optimum. The sequences are stored beside the returns, so that anyone can replay them.
 
+On the randomised tier every episode has a plant of its own, and the optimum knows it: an upper bound on what a
+controller can reach that does not. The sensed tier has the nominal plant, starts and reward, hence the nominal optimum:
+again an upper bound, for it sees the state.
+
 Computing needs no compiled code of its own: all dynamics go through ``kernel.control_intervals``.
 """
 
 import dataclasses
 import functools
 import json
+import math
+import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import sd_friction_env
 from sd_friction_env import kernel
 from sd_friction_env.env import ACTUATOR_CODES, SDFrictionEnv
-from sd_friction_env.task import passive_motion
+from sd_friction_env.parameters import OscillatorParameters
+from sd_friction_env.policies import PolicyFileError, Readings, State
+from sd_friction_env.tables import atomic_file
+from sd_friction_env.task import Task, passive_motion
 
 Array = NDArray[np.float64]
 Progress = Callable[[range, str], Iterable[int]]
 
 OPTIMUM_DIRECTORY = Path(__file__).parent / "optimum"
 TASKS = {"force": "SDFriction/Force-v0", "belt": "SDFriction/BeltSpeed-v0"}
+RANDOMISED = {"force": "SDFriction/ForceRandomised-v0", "belt": "SDFriction/BeltSpeedRandomised-v0"}
+SENSED = {"force": "SDFriction/ForceSensed-v0", "belt": "SDFriction/BeltSpeedSensed-v0"}
+# The files' names; the sensed tier differs from the nominal one only in what a controller sees.
+_FILES = {
+    **{env_id: task for tier in (TASKS, SENSED) for task, env_id in tier.items()},
+    **{env_id: f"{task}-randomised" for task, env_id in RANDOMISED.items()},
+}
 
 ACTION_LEVELS = 32767  # stored actions are whole numbers of 1/32767: half the size, and far finer than it matters
+SPAN = 1e-6  # of a whole episode's return: at most 5e-4
 GOLDEN_STEPS = 60
 GOLDEN_TOLERANCE = 1e-7  # other builds round differently, and stick-slip may amplify that; a changed law moves 1e-3
 _UNSEEN = ("sensor", "sensor_noise", "sensor_delay", "observation_limit", "x_offset", "x_scale", "v_scale")
@@ -55,45 +72,65 @@ def _silent(steps: range, label: str) -> Iterable[int]:
 
 @dataclass(frozen=True)
 class Problem:
-    """A task's dynamics and the starts to be steered from.
+    """A task's dynamics and the starts to be steered from, each with the plant of its episode.
 
     Attributes:
         env_id: the environment's registered id.
-        constants: what ``kernel.control_interval`` takes before the state.
-        belt_moves: whether the belt speed is a state (else it stays at its nominal value).
-        steps: control intervals in an episode.
+        task: its configuration.
+        parameters: of the plant of each episode, n of them.
         starts: states (x, v, v_belt), shape (n, 3).
     """
 
     env_id: str
-    constants: tuple[float, ...]
-    belt_moves: bool
-    steps: int
+    task: Task
+    parameters: tuple[OscillatorParameters, ...]
     starts: Array
+
+    @property
+    def belt_moves(self) -> bool:
+        """Whether the belt speed is a state (else it stays at its nominal value)."""
+        return self.task.actuator == "belt_speed"
+
+    @property
+    def steps(self) -> int:
+        """Control intervals in an episode."""
+        return self.task.episode_steps
 
     @property
     def dimensions(self) -> int:
         """Number of state variables that change: 2 or 3."""
         return 3 if self.belt_moves else 2
 
+    @functools.cached_property
+    def plants(self) -> dict[OscillatorParameters, NDArray[np.int64]]:
+        """The different plants, and the starts that belong to each."""
+        found: dict[OscillatorParameters, list[int]] = {}
+        for i, parameters in enumerate(self.parameters):
+            found.setdefault(parameters, []).append(i)
+        return {parameters: np.array(rows) for parameters, rows in found.items()}
+
+    def select(self, rows: NDArray[np.int64]) -> "Problem":
+        """Return the problem of some of the starts (which may be repeated)."""
+        return dataclasses.replace(
+            self, parameters=tuple(self.parameters[row] for row in rows), starts=self.starts[rows]
+        )
+
     def step(self, states: Array, actions: Array) -> tuple[Array, Array]:
         """Return the states one control interval later, shape (..., 3), and the rewards, shape (...).
 
         Args:
-            states: shape (..., 3). actions: in [-1, 1], shape (...).
+            states: shape (..., 3). actions: in [-1, 1], shape (...). With several plants, the first axis is that of the
+                starts.
 
         Raises:
             RuntimeError: if a mass loses contact with the belt or the integrator gives up.
         """
-        shape = actions.shape
-        columns = np.ascontiguousarray(states.reshape(-1, 3).T)
-        ends = np.empty_like(columns)
-        rewards = np.empty(columns.shape[1])
-        arguments: list[Any] = [*self.constants, *columns, np.ascontiguousarray(actions.reshape(-1)), *ends, rewards]
-        failures = kernel.control_intervals(*arguments)
-        if failures:
-            raise RuntimeError(f"{failures} of {rewards.size} states lost contact or were not integrated")
-        return ends.T.reshape(*shape, 3), rewards.reshape(shape)
+        if len(self.plants) == 1:
+            return _step(self.task, self.parameters[0], states, actions)
+        ends, rewards = np.empty_like(states), np.empty(actions.shape)
+        for parameters, rows in self.plants.items():
+            ends[rows], rewards[rows] = _step(self.task, parameters, states[rows], actions[rows])
+        return ends, rewards
 
     def rollout(self, actions: Array) -> tuple[Array, Array]:
         """Return the states met, shape (n, steps + 1, 3), and the rewards, shape (n, steps), of action sequences.
@@ -114,26 +151,39 @@ class Problem:
         return returns
 
 
+def _step(task: Task, parameters: OscillatorParameters, states: Array, actions: Array) -> tuple[Array, Array]:
+    """Do what :meth:`Problem.step` says, for one plant."""
+    columns = np.ascontiguousarray(states.reshape(-1, 3).T)
+    ends = np.empty_like(columns)
+    rewards = np.empty(columns.shape[1])
+    numbers = _constants(task, parameters)
+    arguments: list[Any] = [*numbers, *columns, np.ascontiguousarray(actions.reshape(-1)), *ends, rewards]
+    failures = kernel.control_intervals(*arguments)
+    if failures:
+        raise RuntimeError(f"{failures} of {rewards.size} states lost contact or were not integrated")
+    return ends.T.reshape(*actions.shape, 3), rewards.reshape(actions.shape)
+
+
 def make_problem(env_id: str, seeds: Sequence[int]) -> Problem:
-    """Return the problem that an environment poses from the starts of ``reset(seed=...)``."""
+    """Return the problem that an environment poses from the starts, and with the plants, of ``reset(seed=...)``."""
     env = _make(env_id)
     starts = np.empty((len(seeds), 3))
+    parameters = []
     for i, seed in enumerate(seeds):
         _, info = env.reset(seed=int(seed))
         starts[i] = info["x"], info["v"], info["v_belt"]
-    belt_moves = env.task.actuator == "belt_speed"
-    return Problem(env_id, _constants(env), belt_moves, env.task.episode_steps, starts)
+        parameters.append(env.parameters)
+    return Problem(env_id, env.task, tuple(parameters), starts)
 
 
-def _constants(env: SDFrictionEnv) -> tuple[float, ...]:
-    """Return what ``kernel.control_interval`` needs of an environment, in its order."""
-    task = env.task
+def _constants(task: Task, parameters: OscillatorParameters) -> tuple[float, ...]:
+    """Return what ``kernel.control_interval`` takes before the state, in its order."""
     return (
-        *env.parameters.plant,
+        *parameters.plant,
         ACTUATOR_CODES[task.actuator],
         task.authority,
         task.belt_acceleration_limit,
-        env.parameters.belt_speed,
+        parameters.belt_speed,
         task.control_interval,
         task.w_effort,
         task.w_stick,
@@ -193,30 +243,35 @@ class Grid:
         return interpolated.reshape(states.shape[:-1])
 
 
-def make_grid(env_id: str, sizes: Sequence[int]) -> Grid:
-    """Return a grid with room around the passive cycle, on which contact is never lost.
+def make_grid(problem: Problem, sizes: Sequence[int]) -> Grid:
+    """Return a grid with room around the passive motion, on which contact is never lost.
 
     Args:
-        sizes: nodes along x, v_rel and, where the belt moves, v_belt.
+        problem: of one plant. sizes: nodes along x, v_rel and, where the belt moves, v_belt.
 
     Raises:
-        ValueError: if the number of sizes or one of them does not fit.
+        ValueError: if the number of sizes or one of them does not fit, or the problem has several plants.
     """
-    env = _make(env_id)
-    belt_moves = env.task.actuator == "belt_speed"
+    env_id, belt_moves = problem.env_id, problem.belt_moves
     if len(sizes) != 2 + belt_moves or min(sizes) < 3:
         raise ValueError(f"{env_id} needs {2 + belt_moves} grid sizes of at least 3, got {tuple(sizes)!r}")
-    cycle = passive_motion(env.nominal)
+    if len(problem.plants) != 1:
+        raise ValueError(f"a grid is for one plant, got a problem with {len(problem.plants)}")
+    parameters = problem.parameters[0]
+    cycle = passive_motion(parameters)
     assert cycle is not None
-    belt_speed = env.nominal.belt_speed
-    margin = 0.4 * cycle.amplitude
-    swing = env.task.belt_authority * belt_speed if belt_moves else 0.0
-    v_rel_low = -(belt_speed + swing + 1.3 * cycle.amplitude)
+    belt_speed = parameters.belt_speed
+    x_min, x_max = min(cycle.x_min, problem.starts[:, 0].min()), max(cycle.x_max, problem.starts[:, 0].max())
+    # Above v_b1 passive motion dies out, and an episode starts with a kick.
+    amplitude = max(cycle.amplitude, 0.5 * (x_max - x_min), -problem.starts[:, 1].min())
+    margin = 0.4 * amplitude
+    swing = problem.task.belt_authority * belt_speed if belt_moves else 0.0
+    v_rel_low = -(belt_speed + swing + 1.3 * amplitude)
     v_rel_high = 2.0 * swing + 0.05  # a belt that brakes from its highest to its lowest speed is outrun by so much
     # The upper end moves a little, so that a node falls on zero.
     below = min(round((sizes[1] - 1) * v_rel_low / (v_rel_low - v_rel_high)), sizes[1] - 2)
     v_rel_high = -v_rel_low * (sizes[1] - 1 - below) / below
-    lows, highs = [cycle.x_min - margin, v_rel_low], [cycle.x_max + margin, v_rel_high]
+    lows, highs = [x_min - margin, v_rel_low], [x_max + margin, v_rel_high]
     if belt_moves:
         lows.append(belt_speed - swing)
         highs.append(belt_speed + swing)
@@ -235,6 +290,9 @@ class ValueFunction:
 def value_iteration(problem: Problem, grid: Grid, actions: Array, progress: Progress = _silent) -> ValueFunction:
     """Return V_t = max_a (r_a + T_a V_(t+1)) at t = 0 and 1, from V = 0 after the last step.
 
+    Once a step lowers all values alike (their changes differ by less than ``SPAN``), so does every earlier one, and the
+    rest is extrapolated (M. L. Puterman, Markov Decision Processes (1994), section 8.5: the span criterion).
+
     Args:
         actions: what is tried in every node, shape (n,). On belt the grid's own belt speeds should be among the
             targets: the belt then moves from node to node, and interpolation does not blur its speed.
@@ -251,10 +309,13 @@ def value_iteration(problem: Problem, grid: Grid, actions: Array, progress: Prog
         rewards.append(reward)
     value = np.zeros(len(nodes))
     previous = value
-    for _ in progress(range(problem.steps), "backward induction"):
+    for left in progress(range(problem.steps - 1, -1, -1), "backward induction"):
         previous, value = value, np.full(len(nodes), -np.inf)
         for transition, reward in zip(transitions, rewards, strict=True):
             np.maximum(value, reward + transition @ previous, out=value)
+        change = value - previous
+        if np.ptp(change) < SPAN:
+            return ValueFunction(grid, value + left * change, previous + left * change)
     return ValueFunction(grid, value, previous)
 
 
@@ -288,16 +349,24 @@ def greedy_actions(
         if prefix is not None and t < decided:
             sequences[:, t] = prefix[:, t]
         else:
-            centre, width = np.zeros(n), 1.0
-            for _ in range(3):
-                tried = np.clip(centre[:, None] + width * np.linspace(-1.0, 1.0, count), -1.0, 1.0)
-                ends, rewards = problem.step(np.repeat(states[:, None], count, axis=1), tried)
-                best = np.argmax(rewards + value.grid.interpolate(value.after_first, ends), axis=1)
-                centre = tried[np.arange(n), best]
-                width *= 4.0 / count
-            sequences[:, t] = centre
+            sequences[:, t] = _look_ahead(problem.step, value.grid, value.after_first, states, count)
         states, _ = problem.step(states, sequences[:, t])
     return sequences
+
+
+def _look_ahead(
+    step: Callable[[Array, Array], tuple[Array, Array]], grid: Grid, values: Array, states: Array, count: int
+) -> Array:
+    """Return the actions, shape (n,), that are best one step ahead in states of shape (n, 3)."""
+    n = len(states)
+    centre, width = np.zeros(n), 1.0
+    for _ in range(3):
+        tried = np.clip(centre[:, None] + width * np.linspace(-1.0, 1.0, count), -1.0, 1.0)
+        ends, rewards = step(np.repeat(states[:, None], count, axis=1), tried)
+        best = np.argmax(rewards + grid.interpolate(values, ends), axis=1)
+        centre = tried[np.arange(n), best]
+        width *= 4.0 / count
+    return centre
 
 
 def beam_actions(
@@ -438,19 +507,20 @@ def _backward(problem: Problem, actions: Array, at: _Derivatives, damping: Array
 
 
 def _follow(problem: Problem, states: Array, actions: Array, changes: Array, gains: Array) -> tuple[Array, Array]:
-    """Return the actions taken, shape (m, n, steps), and the returns, shape (m, n), of changed sequences that are
+    """Return the actions taken, shape (n, m, steps), and the returns, shape (n, m), of changed sequences that are
     steered back to their quadratic model along the way.
 
     Args:
-        states: (n, steps + 1, 3). actions: (n, steps). changes: (m, n, steps). gains: (m, n, steps, dimensions).
+        states: (n, steps + 1, 3). actions: (n, steps). changes: (n, m, steps). gains: (n, m, steps, dimensions).
     """
-    m, n, steps = changes.shape
+    n, m, steps = changes.shape
     size = problem.dimensions
-    taken, returns = np.empty((m, n, steps)), np.zeros((m, n))
-    now = np.repeat(states[None, :, 0], m, axis=0)
+    taken, returns = np.empty((n, m, steps)), np.zeros((n, m))
+    now = np.repeat(states[:, None, 0], m, axis=1)
     for t in range(steps):
-        off = now[..., :size] - states[None, :, t, :size]
-        taken[..., t] = np.clip(actions[:, t] + changes[..., t] + np.sum(gains[..., t, :] * off, axis=-1), -1.0, 1.0)
+        off = now[..., :size] - states[:, None, t, :size]
+        wanted = actions[:, None, t] + changes[..., t] + np.sum(gains[..., t, :] * off, axis=-1)
+        taken[..., t] = np.clip(wanted, -1.0, 1.0)
         now, rewards = problem.step(now, taken[..., t])
         returns += rewards
     return taken, returns
@@ -467,9 +537,9 @@ def refine(
     actions = actions.copy()
     damping = np.full(len(actions), 1e-2)
     active = np.arange(len(actions))
-    lengths = np.array(_STEP_LENGTHS)[:, None, None]
+    lengths = np.array(_STEP_LENGTHS)[:, None]
     for _ in progress(range(iterations), "refinement"):
-        part = dataclasses.replace(problem, starts=problem.starts[active])
+        part = problem.select(active)
         mine = actions[active]
         states, rewards = part.rollout(mine)
         before = rewards.sum(axis=1)
@@ -477,13 +547,13 @@ def refine(
         all_changes, all_gains = [], []
         for curved in (True, False):
             changes, gains = _backward(part, mine, at, damping[active], curved)
-            all_changes.append(lengths * changes)
-            all_gains.append(np.broadcast_to(gains, (len(lengths), *gains.shape)))
-        taken, returns = _follow(part, states, mine, np.concatenate(all_changes), np.concatenate(all_gains))
-        best = np.argmax(returns, axis=0)
-        after = returns[best, np.arange(len(active))]
+            all_changes.append(lengths * changes[:, None])
+            all_gains.append(np.repeat(gains[:, None], len(lengths), axis=1))
+        taken, returns = _follow(part, states, mine, np.concatenate(all_changes, 1), np.concatenate(all_gains, 1))
+        best = np.argmax(returns, axis=1)
+        after = returns[np.arange(len(active)), best]
         better = after > before
-        actions[active[better]] = taken[best, np.arange(len(active))][better]
+        actions[active[better]] = taken[np.arange(len(active)), best][better]
         worthwhile = after - before > tolerance * np.abs(before)
         damping[active] *= np.where(worthwhile, 0.3, 10.0)
         damping = np.maximum(damping, 1e-6)
@@ -529,6 +599,28 @@ def exchange(problem: Problem, actions: Array, offers: int = 3, reach: int = 40)
     return offered
 
 
+def settle(problem: Problem, actions: Array, gains: Sequence[float] = (0.1, 0.25, 0.5, 1.0, 2.0)) -> Array:
+    """Return sequences that end in velocity feedback where that is better (never worse), shape (n, steps).
+
+    A policy from a coarse grid may let the belt rest at a node beside its nominal speed, which costs little and for
+    ever. A force works against the velocity, a belt follows it: near the equilibrium, both damp.
+    """
+    n, m = len(actions), len(gains)
+    states, rewards = problem.rollout(actions)
+    authority = problem.task.authority * (problem.starts[:, 2] if problem.belt_moves else -np.ones(n))
+    factors = np.array(gains) / authority[:, None]
+    candidates = [actions]
+    for first in range(problem.steps // 5, problem.steps, max(1, problem.steps // 20)):
+        ends, totals = np.repeat(actions[:, None], m, axis=1), np.zeros((n, m))
+        now = np.repeat(states[:, None, first], m, axis=1)
+        for t in range(first, problem.steps):
+            ends[..., t] = np.clip(factors * now[..., 1], -1.0, 1.0)
+            now, reward = problem.step(now, ends[..., t])
+            totals += reward
+        candidates.append(ends[np.arange(n), totals.argmax(axis=1)])
+    return best_of(problem, candidates)
+
+
 def best_of(problem: Problem, candidates: Iterable[Array]) -> Array:
     """Return the best sequence per start of several arrays of shape (n, steps)."""
     stacked = list(candidates)
@@ -542,7 +634,7 @@ def improve(problem: Problem, actions: Array, rounds: int, iterations: int = 30,
     actions = refine(problem, actions, iterations, progress)
     for _ in range(rounds if len(actions) > 1 else 0):
         offers = exchange(problem, actions)
-        everyone = dataclasses.replace(problem, starts=np.tile(problem.starts, (len(offers), 1)))
+        everyone = problem.select(np.tile(np.arange(len(actions)), len(offers)))
         offers = refine(everyone, offers.reshape(-1, problem.steps), iterations, progress).reshape(offers.shape)
         actions = best_of(problem, [actions, *offers])
     return actions
@@ -562,11 +654,16 @@ def decode(levels: NDArray[np.int16]) -> NDArray[np.float32]:
 
 
 def fingerprint(env_id: str, seeds: Sequence[int]) -> dict[str, Any]:
-    """Return what a stored optimum depends on: configuration, starts (x, v) and a golden rollout, all JSON values."""
+    """Return what a stored optimum depends on: configuration, starts (x, v) and a golden rollout, all JSON values.
+
+    Where parameters are randomised, ``draws`` holds those of each seed, in the order of their names.
+    """
     env = _make(env_id)
     task = {name: value for name, value in dataclasses.asdict(env.task).items() if name not in _UNSEEN}
     configuration = {"task": task, "parameters": dataclasses.asdict(env.nominal)}
-    starts = make_problem(env_id, seeds).starts[:, :2].tolist()
+    problem = make_problem(env_id, seeds)
+    names = sorted(env.task.randomise or ())
+    draws = {"draws": [[getattr(plant, name) for name in names] for plant in problem.parameters]} if names else {}
     env.reset(options={"x": 0.0}, seed=0)
     golden = []
     for t in range(GOLDEN_STEPS):
@@ -574,7 +671,8 @@ def fingerprint(env_id: str, seeds: Sequence[int]) -> dict[str, Any]:
         action = np.array([(7 * (t // 3) % 11) / 5.0 - 1.0], np.float32)
         _, reward, _, _, info = env.step(action)
         golden.append([info["x"], info["v"], info["v_belt"], float(reward)])
-    return {"configuration": json.loads(json.dumps(configuration)), "starts": starts, "golden": golden[4::5]}
+    starts = problem.starts[:, :2].tolist()
+    return {"configuration": json.loads(json.dumps(configuration)), "starts": starts, **draws, "golden": golden[4::5]}
 
 
 def check_fingerprint(stored: dict[str, Any], env_id: str, seeds: Sequence[int]) -> None:
@@ -590,21 +688,25 @@ def check_fingerprint(stored: dict[str, Any], env_id: str, seeds: Sequence[int])
         before = stored["configuration"].get(part, {})
         names = sorted(name for name in before if before[name] != values.get(name))
         changed += [f"{part} {name}: {before.get(name)!r} -> {values.get(name)!r}" for name in names]
-    for part, what in (("starts", "the starts of the evaluation seeds"), ("golden", "the dynamics or the reward")):
-        before, after = np.array(stored[part]), np.array(now[part])
+    for part, what in (
+        ("starts", "the starts of the evaluation seeds"),
+        ("draws", "the parameters of the evaluation seeds"),
+        ("golden", "the dynamics or the reward"),
+    ):
+        before, after = np.array(stored.get(part, [])), np.array(now.get(part, []))
         if before.shape != after.shape or not np.allclose(before, after, rtol=0.0, atol=GOLDEN_TOLERANCE):
             changed.append(what)
     if changed:
-        task = next(name for name, known in TASKS.items() if known == env_id)
+        task, _, randomised = _FILES[env_id].partition("-")
+        tier = " --tier randomised" if randomised else ""
         raise RuntimeError(
             f"the stored optimum of {env_id} was computed for another environment ({'; '.join(changed)}): "
-            f"recompute it with `python scripts/optimum.py --task {task}`"
+            f"recompute it with `python scripts/optimum.py --task {task}{tier}`"
         )
 
 
 def _paths(env_id: str, directory: Path) -> tuple[Path, Path]:
-    task = next(name for name, known in TASKS.items() if known == env_id)
-    return directory / f"{task}.json", directory / f"{task}.npz"
+    return directory / f"{_FILES[env_id]}.json", directory / f"{_FILES[env_id]}.npz"
 
 
 def save_optimum(
@@ -619,7 +721,8 @@ def save_optimum(
     returns = problem.returns(decode(levels).astype(np.float64))
     table, sequences = _paths(problem.env_id, directory)
     directory.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(sequences, levels=levels)
+    with atomic_file(sequences, "wb") as file:
+        np.savez_compressed(file, levels=levels)
     content = {
         "env_id": problem.env_id,
         "mean_return": float(returns.mean()),
@@ -630,13 +733,29 @@ def save_optimum(
     }
     # One number list per line: small, and a change shows as one.
     lines = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in content.items()]
-    table.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+    with atomic_file(table) as file:
+        file.write("{\n" + ",\n".join(lines) + "\n}\n")
     return returns
 
 
-@functools.lru_cache(maxsize=4)
+def stored_study(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[str, Any]:
+    """Return all that the table of a stored optimum says, among it ``command``, ``stages`` (mean return by stage) and
+    ``value_estimates`` (mean by grid).
+
+    Raises:
+        FileNotFoundError: if nothing is stored for the id.
+    """
+    env_id = _bare_id(env_id)
+    if env_id not in _FILES or not _paths(env_id, directory)[0].exists():
+        there = [name for name in _FILES if _paths(name, directory)[0].exists()]
+        raise FileNotFoundError(f"no optimum is stored for {env_id!r}; stored: {', '.join(there) or 'none'}")
+    content: dict[str, Any] = json.loads(_paths(env_id, directory)[0].read_text(encoding="utf-8"))
+    return content
+
+
+@functools.lru_cache(maxsize=8)
 def _checked_table(env_id: str, directory: Path) -> dict[int, float]:
-    stored = json.loads(_paths(env_id, directory)[0].read_text(encoding="utf-8"))
+    stored = stored_study(env_id, directory)
     check_fingerprint(stored["fingerprint"], env_id, stored["seeds"])
     return dict(zip(stored["seeds"], stored["returns"], strict=True))
 
@@ -650,14 +769,16 @@ def optimal_returns(
 ) -> NDArray[np.float64] | None:
     """Return the best known undiscounted return from the starts of ``reset(seed=...)``, shape (n,).
 
-    None if the id has no reference (the randomised and sensed tiers).
+    On the randomised tier it is that of a controller which knows each episode's parameters, on the sensed tier that of
+    one which sees the state (the nominal optimum: plant, starts and reward are the same): upper bounds on what those
+    can reach that do not. None if the id has no reference.
 
     Raises:
         ValueError: if a seed is not among those stored.
         RuntimeError: if the environment has changed since the reference was computed.
     """
     env_id = _bare_id(env_id)
-    if env_id not in TASKS.values() or not _paths(env_id, directory)[0].exists():
+    if env_id not in _FILES or not _paths(env_id, directory)[0].exists():
         return None
     table = _checked_table(env_id, directory)
     missing = [int(seed) for seed in seeds if int(seed) not in table]
@@ -675,13 +796,127 @@ def optimal_actions(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> tuple[l
     Raises:
         FileNotFoundError: if nothing is stored for the id.
     """
-    env_id = _bare_id(env_id)
-    if env_id not in TASKS.values():
-        raise FileNotFoundError(f"no optimum is stored for {env_id!r}; stored: {', '.join(TASKS.values())}")
-    table, sequences = _paths(env_id, directory)
-    stored = json.loads(table.read_text(encoding="utf-8"))
-    with np.load(sequences, allow_pickle=False) as archive:
+    stored = stored_study(env_id, directory)
+    with np.load(_paths(_bare_id(env_id), directory)[1], allow_pickle=False) as archive:
         return stored["seeds"], decode(archive["levels"])
+
+
+# A controller that acts on a value function ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class OptimalPolicy:
+    """Looks one control interval ahead on the nominal plant and takes the action with the best reward and value.
+
+    It offers what :mod:`sd_friction_env.policies` says of all controllers, and needs to see the velocity. States
+    outside of the grid count as the nearest on its border.
+
+    Attributes:
+        task, parameters: of the environment the value was computed for.
+        readings: how its observations are turned back into x, v and v_belt.
+        grid: of the value function. values: best return still to come from each node, shape (prod(sizes),).
+        count: even actions tried, three times, ever closer to the best.
+
+    Raises:
+        ValueError: if there is not one finite value for each node.
+    """
+
+    task: Task
+    parameters: OscillatorParameters
+    readings: Readings
+    grid: Grid
+    values: Array
+    count: int = 41
+
+    def __post_init__(self) -> None:
+        nodes = math.prod(self.grid.sizes)
+        if self.values.shape != (nodes,) or not np.isfinite(self.values).all():
+            raise ValueError(f"values must be {nodes} finite numbers, got shape {self.values.shape}")
+
+    @classmethod
+    def load(cls, env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> Self:
+        """Return the stored policy of a nominal task; it runs on the randomised tier too, and takes its plant there to
+        be the nominal one.
+
+        Raises:
+            FileNotFoundError: if none is stored for the id.
+            RuntimeError: if the environment has changed since its value function was computed.
+            PolicyFileError: if the file cannot be read.
+        """
+        env_id = _bare_id(env_id)
+        path = _value_path(env_id, directory) if env_id in TASKS.values() else None
+        if path is None or not path.exists():
+            raise FileNotFoundError(f"no value function is stored for {env_id!r}; allowed: {', '.join(TASKS.values())}")
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                stored = json.loads(str(archive["fingerprint"]))
+                lows, highs, values = archive["lows"], archive["highs"], archive["values"]
+        except (KeyError, OSError, ValueError, zipfile.BadZipFile) as error:
+            raise PolicyFileError(f"{str(path)!r} is no value function: {error}") from None
+        check_fingerprint(stored, env_id, [])
+        env = _make(env_id)
+        grid = Grid(tuple(lows.tolist()), tuple(highs.tolist()), values.shape)
+        return cls(env.task, env.nominal, Readings.from_env(env), grid, values.ravel().astype(np.float64))
+
+    def actions(self, states: Array) -> Array:
+        """Return the best actions in states (x, v, v_belt) of shape (n, 3), shape (n,)."""
+        lows, highs = self.grid.lows, self.grid.highs
+        x = np.clip(states[:, 0], lows[0], highs[0])  # beyond the grid the mass may lose contact on the way
+        v_belt = np.clip(states[:, 2], lows[2], highs[2]) if len(lows) == 3 else states[:, 2]
+        v = np.clip(states[:, 1] - v_belt, lows[1], highs[1]) + v_belt
+        # The reading of a stuck mass is rounded: it is put back on the belt.
+        v = np.where(np.abs(v - v_belt) < 1e-7, v_belt, v)
+        step = functools.partial(_step, self.task, self.parameters)
+        return _look_ahead(step, self.grid, self.values, np.stack([x, v, v_belt], axis=1), self.count)
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], State]:
+        """Return the best actions for one observation or a batch of them; see :mod:`sd_friction_env.policies`.
+
+        Raises:
+            ValueError: if an observation is not finite or too short.
+        """
+        values = self.readings.read(observation)
+        if not np.isfinite(values).all():
+            raise ValueError("observation must be finite")
+        states = np.full((*values.shape[:-1], 3), self.parameters.belt_speed)
+        states[..., 0] = values[..., 0] + self.readings.x_equilibrium
+        states[..., 1] = values[..., 1]
+        if self.task.actuator == "belt_speed":
+            states[..., 2] += self.readings.authority * values[..., 2]
+        actions = self.actions(states.reshape(-1, 3))
+        return actions.astype(np.float32).reshape(*values.shape[:-1], 1), None
+
+
+def _value_path(env_id: str, directory: Path) -> Path:
+    return directory / f"{_FILES[env_id]}-value.npz"
+
+
+def save_value(problem: Problem, value: ValueFunction, directory: Path = OPTIMUM_DIRECTORY) -> Path:
+    """Store a value function of a nominal task for :meth:`OptimalPolicy.load`, in single precision; return its path.
+
+    Raises:
+        ValueError: if the problem is not that of a nominal task.
+        OSError: if the file cannot be written.
+    """
+    if problem.env_id not in TASKS.values():
+        raise ValueError(f"env_id must be one of {', '.join(TASKS.values())}, got {problem.env_id!r}")
+    path = _value_path(problem.env_id, directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    content = {
+        "values": value.after_first.reshape(value.grid.sizes).astype(np.float32),
+        "lows": np.array(value.grid.lows),
+        "highs": np.array(value.grid.highs),
+        "fingerprint": np.array(json.dumps(fingerprint(problem.env_id, []))),
+    }
+    with atomic_file(path, "wb") as file:
+        np.savez_compressed(file, **content)  # type: ignore[arg-type]
+    return path
 
 
 # All of it ------------------------------------------------------------------------------------------------------------
@@ -732,15 +967,26 @@ def find_optimum(
         note("stored before", known)
     for sizes in grids:
         name = "x".join(map(str, sizes))
-        grid = make_grid(problem.env_id, sizes)
-        value = value_iteration(problem, grid, grid_actions(problem, grid), progress)
-        estimates[name] = float(grid.interpolate(value.whole, problem.starts).mean())
+        estimate = np.empty(len(problem.starts))
+        greedy, searched = np.empty_like(candidates[0]), np.empty_like(candidates[0])
+        plants = list(problem.plants.values())
+        for i in progress(range(len(plants)), f"plants on {name}") if len(plants) > 1 else (0,):
+            rows = plants[i]
+            part = problem.select(rows)
+            grid = make_grid(part, sizes)
+            value = value_iteration(part, grid, grid_actions(part, grid), progress)
+            estimate[rows] = grid.interpolate(value.whole, part.starts)
+            greedy[rows] = greedy_actions(part, value, progress)
+            if beam:
+                searched[rows] = beam_actions(part, value, beam, min(200, problem.steps), progress)
+        estimates[name] = float(estimate.mean())
         report(f"value function's estimate {name}", estimates[name])
-        note(f"greedy {name}", greedy_actions(problem, value, progress))
+        note(f"greedy {name}", greedy)
         if beam:
-            note(f"beam {beam} {name}", beam_actions(problem, value, beam, min(200, problem.steps), progress))
-            note(f"beam {beam} {name}, refined", refine(problem, candidates[-1], 30, progress))
+            note(f"beam {beam} {name}", searched)
+            note(f"beam {beam} {name}, refined", refine(problem, searched, 30, progress))
     note("best of these per start", best_of(problem, candidates))
+    note("ended in velocity feedback where that is better", settle(problem, candidates[-1]))
     note(f"refined, {rounds} rounds of exchange", improve(problem, candidates[-1], rounds, progress=progress))
     return Study(candidates[-1], stages, estimates)
 

@@ -39,6 +39,7 @@ _FOLDER = re.compile(rf"({'|'.join(TASKS)})-({'|'.join(TIERS)})-({'|'.join(runs.
 _LEARNING = ("steps", "seconds", "mean_return", "suppressed")  # columns read from evaluations.csv
 _OPTIMUM_KNOWS = {"nominal": "", "randomised": " (told the parameters)", "sensed": " (sees all)"}
 _SAMPLE = 0.05  # time between samples of a history
+REACHED = (0.9, 0.95)  # scores whose time in training is told
 
 # What a sweep varies: label, first and last value.
 SWEEPS = {
@@ -381,6 +382,27 @@ def learning_curves(agents: Sequence[Agent]) -> list[Row]:
     return rows
 
 
+def training_times(agents: Sequence[Agent], passive: float, optimum: float) -> list[Row]:
+    """Return for each run how long it took, and after how many seconds its evaluations first reached a score (NaN:
+    never).
+
+    Those evaluations are of the validation episodes; the score is by the means of the evaluation episodes.
+
+    Args:
+        agents: the runs. passive, optimum: mean returns.
+    """
+    rows: list[Row] = []
+    for agent in agents:
+        seconds, returns = agent.evaluations["seconds"], agent.evaluations["mean_return"]
+        row: Row = {"task": agent.task, "tier": agent.tier, "run": agent.name}
+        row |= {"steps": float(agent.evaluations["steps"][-1]), "seconds": float(seconds[-1])}
+        for score in REACHED:
+            there = seconds[(returns - passive) / (optimum - passive) >= score]
+            row[f"seconds_to_{score:g}"] = float(there[0]) if len(there) else float("nan")
+        rows.append(row)
+    return rows
+
+
 # Pictures -------------------------------------------------------------------------------------------------------------
 
 
@@ -533,6 +555,7 @@ class Report:
     sweeps: list[Row] = dataclasses.field(default_factory=list)
     histories: dict[Key, dict[str, Table]] = dataclasses.field(default_factory=dict)
     learning: list[Row] = dataclasses.field(default_factory=list)
+    training: list[Row] = dataclasses.field(default_factory=list)
     pictures: dict[str, tuple[bytes, str]] = dataclasses.field(default_factory=dict)
 
     def stages(self) -> list[tuple[str, Callable[[], None]]]:
@@ -576,6 +599,12 @@ class Report:
 
     def _learn(self) -> None:
         self.learning = learning_curves([agent for agent in self.agents if (agent.task, agent.tier) in self.keys])
+        for key, comparison in self.comparisons.items():
+            passive, best = comparison.rows[0], comparison.rows[-1]
+            # On the randomised tier the optimum is known for some of the episodes only: their means do not compare.
+            if best["kind"] == "optimum" and best["scored_episodes"] == passive["episodes"]:
+                those = [agent for agent in self.agents if (agent.task, agent.tier) == key]
+                self.training += training_times(those, passive["return"], best["return"])
 
     def _draw(self, key: Key) -> None:
         name, words, rows = "-".join(key), f"{key[0]} task, {key[1]} tier", self.comparisons[key].rows
@@ -586,6 +615,12 @@ class Report:
         if mine:
             marks = {row["controller"]: row["return"] for row in rows if row["kind"] == "optimum"}
             caption = f"Learning, {words}: interquartile mean over runs, and the band from the least to the greatest."
+            for score in REACHED:
+                times = [row[f"seconds_to_{score:g}"] for row in self.training if (row["task"], row["tier"]) == key]
+                there = [time for time in times if time == time]
+                if there:
+                    caption += f" Score {score:g} was reached in {len(there)} of {len(times)} runs,"
+                    caption += f" after {np.median(there):.0f} s ({min(there):.0f} to {max(there):.0f})."
             self._keep(f"learning-{name}", draw_learning(mine, {"passive": rows[0]["return"], **marks}), caption)
 
     def _draw_sweeps(self, task: str) -> None:
@@ -618,6 +653,7 @@ class Report:
             "overall": self.overall(),
             "sweeps": self.sweeps,
             "learning": self.learning,
+            "training": self.training,
             "histories": histories,
         }
         return {name: _table(rows) for name, rows in made.items() if rows}

@@ -1,6 +1,7 @@
 """The report: rows, intervals, other plants, histories and learning with known answers, and the page with them."""
 
 import base64
+import dataclasses
 import re
 import subprocess
 import sys
@@ -125,7 +126,7 @@ def test_a_picture_shows_a_middling_run_and_not_the_best(tmp_path):
     made = report.compare(("force", "nominal"), agents, FEW, 0)
     returns = [row["return"] for row in made.runs]
     assert returns[0] > returns[1] > returns[2]
-    assert made.shown == {"PPO": agents[1].policy}
+    assert made.shown["PPO"] is agents[1].policy
 
 
 def test_the_best_classical_controller_is_shown_and_what_is_missing_is_said(monkeypatch):
@@ -267,8 +268,8 @@ def test_the_page_holds_everything_and_needs_nothing(agents_folder, tmp_path, ca
     for name, row in shown.items():
         assert re.search(rf"<td>{re.escape(name)}</td><td>{row['score']:.3f}", page)
     assert "A quick look" in capsys.readouterr().out
-    for name in ("runs", "sweeps", "learning", "histories"):
-        assert Table.from_csv(out / f"{name}.csv").n_rows >= 4
+    for name in ("runs", "sweeps", "learning", "histories", "training"):
+        assert Table.from_csv(out / f"{name}.csv").n_rows >= 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["agents", "out"]
 
 
@@ -326,3 +327,17 @@ def test_the_script_explains_itself():
     command = [sys.executable, "-W", "error", "scripts/report.py", "--help"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
     assert "--agents FOLDER" in done.stdout
+
+
+def test_the_time_to_a_score_is_that_of_the_first_evaluation_that_reaches_it(tmp_path):
+    make_run(tmp_path, "force-nominal-ppo-0", -1.0)
+    (agent,) = report.find_agents(tmp_path)[0]
+    curve = Table(
+        {"steps": [10, 20, 30, 40], "seconds": [1.0, 2.5, 4.0, 5.0], "mean_return": [-100.0, -20.0, -60.0, -14.0]}
+    )
+    (row,) = report.training_times([dataclasses.replace(agent, evaluations=curve)], passive=-110.0, optimum=-10.0)
+    assert row["seconds_to_0.9"] == 2.5  # -20 is .9 of the way, and what comes after does not matter
+    assert row["seconds_to_0.95"] == 5.0
+    assert (row["seconds"], row["steps"], row["run"]) == (5.0, 40.0, "force-nominal-ppo-0")
+    (never,) = report.training_times([dataclasses.replace(agent, evaluations=curve)], passive=-110.0, optimum=-5.0)
+    assert np.isnan(never["seconds_to_0.95"])

@@ -203,6 +203,17 @@ def parser() -> argparse.ArgumentParser:
 
     command = _bare_command(
         commands,
+        "explore",
+        _explore,
+        "the oscillator live in the browser, with sliders, controllers and your own hand",
+        ["", "--port 8080 --no-browser"],
+    )
+    command.add_argument("--port", type=int, default=5006, help="0: any that is free (default: 5006)")
+    command.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
+    command.add_argument("--no-browser", action="store_true", help="open no browser, print the address")
+
+    command = _bare_command(
+        commands,
         "video",
         _video,
         "a video of an episode, without control and with it side by side",
@@ -457,6 +468,23 @@ def _basins(options: argparse.Namespace) -> int:
         plotting.draw_basins(axes[0, 0], x, v, found)
         plotting.save_figure(figure, options.plot)
     return 0
+
+
+def _explore(options: argparse.Namespace) -> int:
+    from sd_friction_env import explorer
+
+    if not 0 <= options.port <= 65535:
+        raise UsageError(f"--port must be in [0, 65535], got {options.port}")
+    explorer.require_bokeh()
+    try:
+        explorer.serve(options.host, options.port, browser=not options.no_browser, say=_say)
+    except OSError as error:
+        raise UsageError(f"cannot listen at --host {options.host} --port {options.port}: {error}") from None
+    return 0
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
 
 
 def _video(options: argparse.Namespace) -> int:

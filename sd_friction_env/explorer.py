@@ -1,0 +1,616 @@
+"""The explorer: a page in the browser that shows the oscillator live; ``sd-friction explore`` (extra "explore").
+
+:class:`Live` is what moves, without any page; :class:`Page` puts it into a Bokeh document, and :func:`serve` offers
+that to browsers. Bokeh's own server, and nothing on top of it: it streams points over one socket, its widgets answer
+within a few milliseconds, and the page loads nothing from elsewhere.
+"""
+
+import contextlib
+import dataclasses
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sd_friction_env.basins import basin_grid
+from sd_friction_env.curves import amplitude_curve
+from sd_friction_env.env import SDFrictionEnv
+from sd_friction_env.orbits import LimitCycle, OrbitError, limit_cycle
+from sd_friction_env.parameters import GEOMETRIES, OscillatorParameters
+from sd_friction_env.plotting import BLACK, BLUE, GREEN, GREY, VERMILION
+from sd_friction_env.policies import ConstantPolicy, Policy, State, VelocityFeedback, ZeroPolicy
+from sd_friction_env.pretrained import load_pretrained
+
+HOST = "127.0.0.1"
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+PORT = 5006
+TASKS = {"force": "Force", "belt": "BeltSpeed"}
+OFF, FEEDBACK, AGENT, ROBUST, OPTIMUM, HAND = (
+    "off",
+    "velocity feedback",
+    "trained agent",
+    "trained agent, robust",
+    "optimum (nominal plant)",
+    "by hand",
+)
+CONTROLLERS = (OFF, FEEDBACK, AGENT, ROBUST, OPTIMUM, HAND)
+
+# Ranges of the sliders (parameters.RANGES allows more): first, last, step.
+SLIDERS: dict[str, tuple[str, float, float, float]] = {
+    "belt_speed": ("belt speed v_b", 0.02, 0.6, 0.005),
+    "alpha": ("anchor height alpha", 0.2, 1.2, 0.01),
+    "g1": ("weight g1", 0.5, 2.0, 0.05),
+    "beta": ("damping beta", 0.0, 0.15, 0.005),
+    "mu_s": ("static friction mu_s", 0.05, 0.5, 0.01),
+    "mu_m": ("least friction mu_m", 0.0, 0.3, 0.01),
+    "v_m": ("speed of least friction v_m", 0.2, 1.0, 0.05),
+}
+_GAIN = 1.5
+_LONGEST = 1_000_000  # steps of an episode: nobody looks on for so long
+_TRAIL, _HISTORY = 200, 600  # control intervals shown
+_TICK = 60  # milliseconds between frames
+_TICKS_A_READING = 4
+_CURVE_SPEEDS = np.linspace(0.005, 0.6, 48)
+
+
+# What moves -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Rider:
+    """An environment under a controller, and what it has earned."""
+
+    env: SDFrictionEnv
+    policy: Policy
+    observation: NDArray[np.float32] | None = None
+    state: State = None
+    begins: bool = True
+    earned: float = 0.0
+    info: dict[str, Any] = field(default_factory=dict)
+
+    def start(self, options: Mapping[str, Any]) -> None:
+        """Begin an episode."""
+        self.observation, self.info = self.env.reset(seed=0, options=dict(options))
+        self.state, self.begins, self.earned = None, True, 0.0
+
+    def step(self) -> bool:
+        """Let one control interval pass; return whether the episode has ended."""
+        assert self.observation is not None
+        action, self.state = self.policy.predict(self.observation[None], self.state, np.array([self.begins]))
+        self.observation, reward, terminated, truncated, self.info = self.env.step(action[0])
+        self.begins = False
+        self.earned += float(reward)
+        return terminated or truncated
+
+
+class Live:
+    """A running oscillator with a controller that can be switched, and two others beside it from the same start: one
+    without control, one under the trained agent, for comparison.
+
+    Args:
+        task: "force" or "belt". parameters: of the plant. Controllers know the nominal plant alone.
+    """
+
+    def __init__(self, task: str = "belt", parameters: OscillatorParameters | None = None) -> None:
+        self.parameters = parameters or OscillatorParameters()
+        self.controller = OFF
+        self.hand = 0.0
+        self.missing: dict[str, str] = {}
+        self.choose_task(task)
+
+    def choose_task(self, task: str) -> None:
+        """Take another actuator, and begin anew."""
+        self.task = task
+        self.env_id = f"SDFriction/{TASKS[task]}-v0"
+        self.rider, self.idle, self.rival = (self._rider(policy) for policy in (OFF, OFF, AGENT))
+        self.choose_controller(self.controller)
+        self.restart()
+
+    def _rider(self, controller: str) -> Rider:
+        env = gym.make(self.env_id, episode_steps=_LONGEST).unwrapped
+        assert isinstance(env, SDFrictionEnv)
+        return Rider(env, self._policy(controller))
+
+    def _policy(self, controller: str) -> Policy:
+        """Return a controller by its name; one that is not there does nothing, and ``missing`` says why."""
+        try:
+            if controller == FEEDBACK:
+                return VelocityFeedback.from_env(gym.make(self.env_id), _GAIN)
+            if controller == AGENT:
+                return load_pretrained(self.env_id)
+            if controller == ROBUST:
+                return load_pretrained(self.env_id.replace("-v0", "Randomised-v0"))
+            if controller == OPTIMUM:
+                from agents.optimal import OptimalPolicy  # of the repository; an installed package has none
+
+                return OptimalPolicy.load(self.env_id)
+        except (ImportError, OSError, ValueError) as error:
+            self.missing[controller] = f"{controller} is not there: {error}"
+            return ZeroPolicy()
+        return ConstantPolicy(self.hand) if controller == HAND else ZeroPolicy()
+
+    def choose_controller(self, controller: str) -> None:
+        """Switch the controller while the oscillator runs on; the comparison begins anew."""
+        self.controller = controller
+        self.rider.policy, self.rider.state, self.rider.begins = self._policy(controller), None, True
+        if self.rider.observation is not None:
+            self.restart(keep=True)
+
+    def steer(self, action: float) -> None:
+        """Set what is done by hand, an action in [-1, 1]."""
+        self.hand = float(np.clip(action, -1.0, 1.0))
+        if self.controller == HAND:
+            self.rider.policy = ConstantPolicy(self.hand)
+
+    def change(self, **values: Any) -> None:
+        """Change parameters of the plant; the mass goes on from where it is.
+
+        Raises:
+            ValueError: if they do not fit together; nothing is then changed.
+        """
+        self.parameters = self.parameters.replace(**values)
+        self.restart(keep=True)
+
+    def restart(self, *, keep: bool = False) -> None:
+        """Begin again on the passive cycle, or from where the mass is now."""
+        options: dict[str, Any] = {"parameters": dataclasses.asdict(self.parameters)}
+        if keep and self.rider.info:
+            options |= {"x": self.rider.info["x"], "v": self.rider.info["v"]}
+        else:
+            options["phase"] = 0.0
+        for rider in (self.rider, self.idle, self.rival):
+            rider.start(options)
+        self.steps = 0
+
+    def advance(self, intervals: int) -> dict[str, list[float]]:
+        """Let control intervals pass; return t, x, v, v_belt, action and stick (0 or 1) at the end of each.
+
+        A mass that loses contact is put back on its cycle.
+        """
+        rows: dict[str, list[float]] = {name: [] for name in ("t", "x", "v", "v_belt", "action", "stick")}
+        for _ in range(intervals):
+            ended = [rider.step() for rider in (self.rider, self.idle, self.rival)]
+            self.steps += 1
+            info = self.rider.info
+            rows["t"].append(self.steps * self.rider.env.task.control_interval)
+            for name in ("x", "v", "v_belt", "action"):
+                rows[name].append(float(info[name]))
+            rows["stick"].append(float(info["stick_fraction"] > 0.5))
+            if any(ended):
+                self.restart()
+                break
+        return rows
+
+    def costs(self) -> dict[str, float]:
+        """Return the mean cost per step since the comparison began: now, without control, the trained agent's."""
+        n = max(self.steps, 1)
+        earned = {"now": self.rider.earned, "without control": self.idle.earned, AGENT: self.rival.earned}
+        return {name: -value / n for name, value in earned.items()}
+
+    def share(self) -> float:
+        """Return how much of what the trained agent saves is saved now: 0 as without control, 1 as the agent."""
+        now, without, agent = self.costs().values()
+        return (without - now) / (without - agent) if without > agent else float("nan")
+
+    # What does not move
+
+    def cycle(self) -> LimitCycle | None:
+        """Return the passive limit cycle; None if there is none that can be named."""
+        try:
+            return limit_cycle(self.parameters)
+        except OrbitError:
+            return None
+
+    def curve(self, speeds: NDArray[np.float64] = _CURVE_SPEEDS) -> dict[str, NDArray[np.float64]]:
+        """Return belt speeds and passive amplitudes, NaN where there is none."""
+        table = amplitude_curve(self.parameters, speeds)
+        return {"belt_speed": table["belt_speed"], "amplitude": table["amplitude"]}
+
+    def basins(self, x: tuple[float, float], v: tuple[float, float]) -> tuple[NDArray[np.float64], str]:
+        """Return where each start of a grid (120 by 80) ends, shape (80, 120): the number of its attractor, NaN where
+        contact is lost or it is not decided; and in words what there is."""
+        _, _, found = basin_grid(self.parameters, x, v, (120, 80))
+        words = []
+        for i, cycle in enumerate(found.attractors):
+            place = 0.5 * (cycle.x_max + cycle.x_min)
+            words.append(
+                f"{found.fraction(i)[0]:.0%} of the starts: {cycle.kind} round {place:.2f}, A = {cycle.amplitude:.3f}"
+            )
+        return np.where(found.labels >= 0, found.labels, np.nan).astype(float), "<br>".join(words)
+
+
+# The page -------------------------------------------------------------------------------------------------------------
+
+
+def require_bokeh() -> None:
+    """Raise unless Bokeh is installed.
+
+    Raises:
+        ImportError: saying what to install.
+    """
+    try:
+        import bokeh  # noqa: F401
+    except ImportError:
+        raise ImportError('the explorer needs bokeh: pip install "sd-friction-env[explore]"') from None
+
+
+_STYLE = """
+:host { font: 14px/1.4 system-ui, sans-serif; color: #202020; }
+b { font-weight: 650; } .big { font-size: 22px; font-weight: 650; }
+.stick { color: #0072B2; } .slip { color: #D55E00; }
+table { border-collapse: collapse; } td { padding: 1px 14px 1px 0; }
+.number { text-align: right; font-variant-numeric: tabular-nums; }
+.warn { border-left: 4px solid #D55E00; padding-left: 8px; }
+"""
+
+
+class Page:
+    """One browser's page: its own oscillator, its widgets, and a tick that moves both on."""
+
+    def __init__(self, document: Any) -> None:
+        from bokeh.layouts import column, row
+        from bokeh.models import (
+            Button,
+            ColumnDataSource,
+            Div,
+            InlineStyleSheet,
+            RadioButtonGroup,
+            Select,
+            Slider,
+            Toggle,
+        )
+
+        self.live = Live()
+        self.style = InlineStyleSheet(css=_STYLE)
+        self.speed = 4  # control intervals a tick
+        self.geometry = Select(options=list(GEOMETRIES), value=self.live.parameters.geometry, title="geometry")
+        self.geometry.on_change("value", self._moved("geometry"))
+        empty: dict[str, list[float]] = {name: [] for name in ("t", "x", "v", "v_belt", "action", "stick")}
+        self.past: dict[str, deque[float]] = {name: deque(maxlen=_HISTORY) for name in empty}
+        self.ticks = 0
+        self.path = ColumnDataSource(empty, name="path")
+        self.trail = ColumnDataSource({"x": [], "v": []}, name="trail")
+        self.mass = ColumnDataSource({"x": [0.0], "v": [0.0], "color": [VERMILION]}, name="mass")
+        self.cycle = ColumnDataSource({"x": [], "v": []}, name="cycle")
+        self.line = ColumnDataSource({"x": [-5.0, 5.0], "v": [0.0, 0.0]}, name="line")
+        self.curve = ColumnDataSource({"belt_speed": [], "amplitude": []}, name="curve")
+        self.point = ColumnDataSource({"belt_speed": [], "amplitude": [], "color": []}, name="point")
+        self.basins = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []}, name="basins")
+        self.spring = ColumnDataSource({"x": [], "y": []}, name="spring")
+        self.marks = ColumnDataSource({"x": [], "y": []}, name="marks")
+        self.anchor = ColumnDataSource({"x": [], "v": []})
+        self.body = ColumnDataSource({"x": [], "y": [], "color": []})
+        self.arrows = ColumnDataSource({"x0": [], "y0": [], "x1": [], "y1": [], "color": []})
+
+        self.sliders = {
+            name: Slider(
+                title=title, start=low, end=high, step=step, value=getattr(self.live.parameters, name), name=name
+            )
+            for name, (title, low, high, step) in SLIDERS.items()
+        }
+        self.sliders["belt_speed"].format = "0.000"
+        for name, slider in self.sliders.items():
+            slider.on_change("value", self._moved(name))
+        self.task = RadioButtonGroup(labels=["push the mass (force)", "drive the belt"], active=1, name="task")
+        self.task.on_change("active", self._task_changed)
+        self.controller = Select(options=list(CONTROLLERS), value=OFF, title="controller", name="controller")
+        self.controller.on_change("value", self._controller_changed)
+        self.hand = Slider(title="by hand: action", start=-1, end=1, step=0.05, value=0, name="hand")
+        self.hand.on_change("value", self._steered)
+        pushes = [Button(label=label, name=f"hand {value}") for label, value in (("◀ -1", -1), ("0", 0), ("+1 ▶", 1))]
+        for button, value in zip(pushes, (-1.0, 0.0, 1.0), strict=True):
+            button.on_click(lambda value=value: self._take_over(value))
+        restart = Button(label="squeal again", button_type="primary", name="restart")
+        restart.on_click(self._restarted)
+        nominal = Button(label="nominal plant", name="nominal")
+        nominal.on_click(self._nominal)
+        basins = Button(label="basins", name="basins button")
+        basins.on_click(self._show_basins)
+        self.pause = Toggle(label="pause", name="pause")
+        self.readout = Div(name="readout", stylesheets=[self.style], width=330, height=160)
+        self.message = Div(name="message", stylesheets=[self.style], width=330)
+        title = Div(
+            text="<span class='big'>Stick, slip, and what control does about it</span><br>A mass on a spring rides a "
+            "moving belt. Friction that falls with speed makes it squeal. Stop it, by a small force or by the belt's "
+            "speed.",
+            stylesheets=[self.style],
+            width=1330,
+        )
+        left = column(
+            self.task,
+            self.controller,
+            self.hand,
+            row(*pushes, width=330),
+            row(restart, self.pause, width=330),
+            self.readout,
+            *self.sliders.values(),
+            self.geometry,
+            row(nominal, basins, width=330),
+            self.message,
+            width=340,
+        )
+        middle = column(self._machine(), self._portrait())
+        right = column(self._history(), self._amplitudes())
+        document.add_root(column(title, row(left, middle, right, spacing=12)))
+        document.title = "sd_friction_env explorer"
+        self._plant_changed()
+        document.add_periodic_callback(self.tick, _TICK)
+
+    # Figures
+
+    def _figure(self, title: str, x: str, y: str, width: int, height: int, **arguments: Any) -> Any:
+        from bokeh.plotting import figure
+
+        plot = figure(title=title, width=width, height=height, toolbar_location=None, tools="", **arguments)
+        plot.xaxis.axis_label, plot.yaxis.axis_label = x, y
+        plot.grid.grid_line_alpha = 0.4
+        plot.outline_line_color = None
+        for axis in plot.axis:
+            axis.axis_label_text_font_style = "normal"
+        return plot
+
+    def _machine(self) -> Any:
+        plot = self._figure("", "", "", 500, 230, x_range=(-1.6, 1.9), y_range=(-0.35, 1.3), match_aspect=True)
+        plot.axis.visible = False
+        plot.grid.visible = False
+        plot.line([-1.6, 1.9], [-0.16, -0.16], line_width=6, color="#404850")
+        plot.scatter("x", "y", source=self.marks, marker="dash", angle=np.pi / 2, size=12, line_width=2, color="white")
+        plot.line("x", "y", source=self.spring, line_width=2, color=BLACK)
+        plot.scatter("x", "v", source=self.anchor, size=10, marker="inverted_triangle", color=BLACK)
+        plot.rect("x", "y", width=0.24, height=0.2, source=self.body, color="color", fill_alpha=0.85)
+        plot.segment("x0", "y0", "x1", "y1", source=self.arrows, color="color", line_width=4)
+        plot.scatter("x1", "y1", source=self.arrows, size=9, color="color")
+        return plot
+
+    def _portrait(self) -> Any:
+        from bokeh.palettes import Cividis
+
+        plot = self._figure(
+            "phase portrait", "displacement x", "velocity v", 500, 400, x_range=(-1.6, 1.6), y_range=(-0.9, 0.9)
+        )
+        plot.image("image", x="x", y="y", dw="dw", dh="dh", source=self.basins, palette=Cividis[11], alpha=0.5)
+        plot.line(
+            "x", "v", source=self.line, line_dash="dotted", color=BLACK, line_width=1.5, legend_label="stick line"
+        )
+        plot.line(
+            "x", "v", source=self.cycle, line_dash="dashed", color=GREY, line_width=2, legend_label="passive cycle"
+        )
+        plot.line("x", "v", source=self.trail, color=GREEN, line_width=2.5, legend_label="now")
+        plot.scatter("x", "v", source=self.mass, size=13, color="color", line_color="white")
+        plot.legend.location = "bottom_left"
+        plot.legend.background_fill_alpha = 0.8
+        plot.legend.label_text_font_size = "9pt"
+        self.portrait = plot
+        return plot
+
+    def _history(self) -> Any:
+        from bokeh.layouts import column
+
+        time = (-_HISTORY * 0.1, 0.0)
+        above = self._figure("displacement (blue where it sticks)", "", "x", 470, 170, x_range=time, y_range=(0, 1))
+        above.line("t", "x", source=self.path, color=GREEN, line_width=1.5)
+        above.scatter("t", "x", source=self.path, size=4, color=BLUE, alpha="stick")
+        below = self._figure("action", "time, now is 0", "a", 470, 130, x_range=above.x_range, y_range=(-1.08, 1.08))
+        below.step("t", "action", source=self.path, color=VERMILION, line_width=1.5)
+        self.history = above
+        return column(above, below)
+
+    def _amplitudes(self) -> Any:
+        plot = self._figure(
+            "amplitude over belt speed", "belt speed v_b", "amplitude A", 470, 330, x_range=(0, 0.62), y_range=(0, 0.6)
+        )
+        self.amplitudes = plot
+        plot.line("belt_speed", "amplitude", source=self.curve, color=GREY, line_width=2.5, legend_label="passive")
+        plot.scatter("belt_speed", "amplitude", source=self.point, size=13, color="color", line_color="white")
+        plot.legend.location = "top_left"
+        plot.legend.label_text_font_size = "9pt"
+        return plot
+
+    # What the user does
+
+    def _moved(self, name: str) -> Callable[[str, Any, Any], None]:
+        def moved(attribute: str, old: Any, new: Any) -> None:
+            with self._said():
+                self.live.change(**{name: new})
+                self._plant_changed()
+
+        return moved
+
+    @contextlib.contextmanager
+    def _said(self) -> Any:
+        """Show on the page what cannot be, instead of raising it."""
+        try:
+            yield
+            self.message.text = ""
+        except (ValueError, OrbitError) as error:
+            self.message.text = f"<div class='warn'>{error}</div>"
+
+    def _task_changed(self, attribute: str, old: int, new: int) -> None:
+        with self._said():
+            self.live.choose_task(list(TASKS)[new])
+            self._clear()
+
+    def _controller_changed(self, attribute: str, old: str, new: str) -> None:
+        with self._said():
+            self.live.choose_controller(new)
+            self._clear()
+        if new in self.live.missing:
+            self.message.text = f"<div class='warn'>{self.live.missing[new]}</div>"
+
+    def _steered(self, attribute: str, old: float, new: float) -> None:
+        if self.controller.value != HAND:
+            self.controller.value = HAND
+        self.live.steer(new)
+
+    def _take_over(self, value: float) -> None:
+        if self.controller.value != HAND:
+            self.controller.value = HAND
+        self.hand.value = value
+        self.live.steer(value)
+
+    def _restarted(self) -> None:
+        with self._said():
+            self.live.restart()
+            self._clear()
+
+    def _nominal(self) -> None:
+        nominal = OscillatorParameters()
+        with self._said():
+            self.live.change(**dataclasses.asdict(nominal))
+        self.geometry.value = nominal.geometry
+        for name, slider in self.sliders.items():
+            slider.value = getattr(nominal, name)
+        self._plant_changed()
+
+    def _show_basins(self) -> None:
+        words = ""
+        with self._said():
+            x, v = (-1.6, 1.6), (-1.2, 1.2)
+            image, words = self.live.basins(x, v)
+            self._look(0.0, x[1], v[1])
+            self.basins.data = {
+                "image": [image],
+                "x": [x[0]],
+                "y": [v[0]],
+                "dw": [x[1] - x[0]],
+                "dh": [v[1] - v[0]],
+            }
+        if words:
+            self.message.text = words
+
+    # What follows
+
+    def _look(self, centre: float, x_reach: float, v_reach: float) -> None:
+        self.portrait.x_range.update(start=centre - x_reach, end=centre + x_reach)
+        self.portrait.y_range.update(start=-v_reach, end=v_reach)
+        self.history.y_range.update(start=centre - x_reach, end=centre + x_reach)
+
+    def _clear(self) -> None:
+        for values in self.past.values():
+            values.clear()
+
+    def _plant_changed(self) -> None:
+        """Show the curve, the cycle and the stick line of the plant as it is now."""
+        self.curve.data = self.live.curve()
+        cycle = self.live.cycle()
+        shape = cycle.points if cycle is not None and cycle.amplitude > 0.0 else np.empty((0, 2))
+        place = cycle.x_max if cycle is not None else 0.8
+        low = cycle.x_min if cycle is not None else -0.8
+        reach = 0.5 * (place - low) + 0.35
+        self._look(round(0.5 * (place + low), 1), round(reach, 1), round(0.7 * reach, 1))
+        highest = np.nanmax(self.curve.data["amplitude"], initial=0.4)
+        self.amplitudes.y_range.end = 0.2 * np.ceil(highest / 0.2 + 0.1)
+        closed = np.concatenate([shape, shape[:1]])
+        self.cycle.data = {"x": closed[:, 0], "v": closed[:, 1]}
+        self.basins.data = {name: [] for name in self.basins.data}
+        self.passive = cycle.amplitude if cycle is not None else float("nan")
+        self._clear()
+
+    def tick(self) -> None:
+        """Let a little time pass, and show it."""
+        if self.pause.active:
+            return
+        live = self.live
+        before = live.steps
+        rows = live.advance(self.speed)
+        if live.steps < before:  # contact was lost, and it begins anew
+            self._clear()
+        for name, values in rows.items():
+            self.past[name].extend(values)
+        # Time runs from the right: axes that stay as they are need no new layout, most of the work of a frame.
+        shown = {name: np.array(values) for name, values in self.past.items()}
+        self.path.data = shown | {"t": shown["t"] - live.steps * live.rider.env.task.control_interval}
+        self.trail.data = {name: shown[name][-_TRAIL:] for name in ("x", "v")}
+        info = live.rider.info
+        sticks = info["stick_fraction"] > 0.5
+        color = BLUE if sticks else VERMILION
+        x, v, v_belt = (float(info[name]) for name in ("x", "v", "v_belt"))
+        self.mass.data = {"x": [x], "v": [v], "color": [color]}
+        self.line.data = {"x": [-5.0, 5.0], "v": [v_belt, v_belt]}
+        self._draw_machine(x, v_belt, float(info["force"]), live.rider.env.get_state().belt_travel, color)
+        lap = shown["x"][-_TRAIL // 2 :]
+        amplitude = 0.5 * float(np.ptp(lap)) if len(lap) else float("nan")
+        speed = live.parameters.belt_speed
+        self.point.data = {"belt_speed": [speed], "amplitude": [amplitude], "color": [GREEN]}
+        self.ticks += 1
+        if self.ticks % _TICKS_A_READING:
+            return
+        state = "<span class='stick'>■ sticks</span>" if sticks else "<span class='slip'>▲ slips</span>"
+        costs = "".join(
+            f"<tr><td>{name}</td><td class='number'>{cost:.3f}</td></tr>" for name, cost in live.costs().items()
+        )
+        self.readout.text = (
+            f"<span class='big'>{state}</span> &nbsp; t = {live.steps * 0.1:.0f}<br>amplitude <b>{amplitude:.3f}</b> "
+            f"(passive {self.passive:.3f})<table><tr><td>mean cost of a step, from one start</td><td></td></tr>{costs}"
+            f"<tr><td>saved, of what the agent saves</td><td class='number'>{live.share():.0%}</td></tr></table>"
+        )
+
+    def _draw_machine(self, x: float, v_belt: float, force: float, travel: float, color: str) -> None:
+        alpha = self.live.parameters.alpha
+        self.anchor.data = {"x": [0.0], "v": [alpha]}
+        along = np.linspace(0.0, 1.0, 25)
+        length = np.hypot(x, alpha)
+        wiggle = 0.05 * np.where((along > 0.1) & (along < 0.9), (-1.0) ** np.arange(25), 0.0)
+        across = np.array([alpha, x]) / length  # normal to the spring
+        self.spring.data = {"x": x * along + across[0] * wiggle, "y": alpha * (1.0 - along) + across[1] * wiggle}
+        self.body.data = {"x": [x], "y": [0.0], "color": [color]}
+        # A force at its limit, and the nominal belt speed, make arrows of the same length.
+        push = 0.5 * force / self.live.rider.env.task.force_limit
+        pull = 0.5 * v_belt / OscillatorParameters().belt_speed
+        self.arrows.data = {
+            "x0": [x if push else np.nan, -1.4],
+            "y0": [0.22, -0.28],
+            "x1": [x + push if push else np.nan, -1.4 + pull],
+            "y1": [0.22, -0.28],
+            "color": [GREEN, "#404850"],
+        }
+        places = np.arange(-1.6, 1.9, 0.25)
+        self.marks.data = {"x": -1.6 + (places + 1.6 + travel) % 3.5, "y": np.full(len(places), -0.16)}
+
+
+def serve(host: str = HOST, port: int = PORT, *, browser: bool = True, say: Callable[[str], None] = print) -> None:
+    """Offer the explorer until interrupted.
+
+    Args:
+        host: address to listen at; others than this machine can come only if it is not a loopback address.
+        port: 0: any that is free. browser: open one. say: is told the page's address.
+
+    Raises:
+        ImportError: if Bokeh is not installed. OSError: if the port is taken.
+    """
+    require_bokeh()
+    from bokeh.application import Application
+    from bokeh.application.handlers.function import FunctionHandler
+    from bokeh.server.server import Server
+
+    # Compiled before the first page asks for it.
+    live = Live()
+    live.advance(2)
+    live.curve()
+    begun = time.perf_counter()
+    live.curve()
+    took = time.perf_counter() - begun
+    name = f"[{host}]" if ":" in host else host
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.create_server((host, port), family=family) as free:  # a taken one is told here, before anything starts
+        port = free.getsockname()[1]
+    # Pages of other sites must not drive the explorer of somebody who only looks at them.
+    places = [f"{name}:{port}", f"localhost:{port}"] if host in LOOPBACK else ["*"]
+    server = Server({"/": Application(FunctionHandler(Page))}, address=host, port=port, allow_websocket_origin=places)
+    address = f"http://{'localhost' if host in ('0.0.0.0', '::') else name}:{server.port}/"
+    server.start()
+    say(f"The explorer is at {address} (a curve takes {1e3 * took:.0f} ms); Ctrl-C ends it.")
+    if browser:
+        server.io_loop.add_callback(server.show, "/")
+    try:
+        server.io_loop.start()
+    except KeyboardInterrupt:
+        say("")
+    finally:
+        server.stop()

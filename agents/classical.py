@@ -95,7 +95,7 @@ KINDS: dict[str, Kind] = {
     "LQR": Kind(_lqr, lambda env: {"log10 weight of x": (-4.0, 4.0), "log10 weight of the action": (-4.0, 4.0)}),
     "sliding mode": Kind(_sliding, lambda env: {"slope": (-3.0, 3.0), "log10 layer": _LAYER, "amplitude": (-1.0, 1.0)}),
     "delayed displacement feedback": Kind(
-        _delayed, lambda env: {"gain": _GAIN, "delay": (1.0, 100.0)}, needs_velocity=False, everywhere=True
+        _delayed, lambda env: {"gain": (-300.0, 300.0), "delay": (1.0, 100.0)}, needs_velocity=False, everywhere=True
     ),
     "linear feedback, velocity estimated": Kind(
         _filtered, lambda env: {"x gain": _GAIN, "v gain": _GAIN, "pole": (0.0, 0.99)}, needs_velocity=False
@@ -125,10 +125,11 @@ def linearised(env: SDFrictionEnv) -> tuple[NDArray[np.float64], NDArray[np.floa
     """
     readings = Readings.from_env(env)
     k = len(readings.names)
+    speed, plant = env.nominal.belt_speed, dataclasses.asdict(env.nominal)
 
     def step(deviation: NDArray[np.float64], action: float) -> NDArray[np.float64]:
-        speed = env.nominal.belt_speed
-        env.reset(seed=0, options={"x": readings.x_equilibrium + deviation[0], "v": deviation[1]})
+        start = {"x": readings.x_equilibrium + deviation[0], "v": deviation[1]}
+        env.reset(seed=0, options=start | {"parameters": plant})
         if k == 3:
             env.set_state(dataclasses.replace(env.get_state(), v_belt=speed + readings.authority * deviation[2]))
         _, _, _, _, info = env.step(np.array([action]))
@@ -178,7 +179,7 @@ def tune(
     env_id: str,
     *,
     seed: int = 0,
-    generations: int = 25,
+    generations: int = 50,
     population: int = 12,
     progress: Callable[[float, float], None] = lambda best, share: None,
 ) -> dict[str, Any]:
@@ -195,7 +196,11 @@ def tune(
 
     def cost(values: NDArray[np.float64]) -> float:
         nonlocal best
-        episodes = evaluation.run_episodes(build(name, env_id, values.tolist()), env_id, TUNING_SEEDS)
+        try:
+            controller = build(name, env_id, values.tolist())
+        except np.linalg.LinAlgError:  # no regulator for such weights
+            return np.inf
+        episodes = evaluation.run_episodes(controller, env_id, TUNING_SEEDS)
         mean = float(np.nansum(episodes.reward, axis=1).mean())
         best = max(best, mean)
         return -mean

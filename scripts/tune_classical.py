@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--tier", nargs="+", choices=TIERS, default=list(TIERS), help="default: all")
     parser.add_argument("--controller", nargs="+", choices=classical.KINDS, help="default: all that the sensor allows")
     parser.add_argument("--seed", type=int, default=0, help="of the search (default: 0)")
-    parser.add_argument("--generations", type=int, default=25, metavar="N", help="of the search (default: 25)")
+    parser.add_argument("--generations", type=int, default=50, metavar="N", help="of the search (default: 50)")
     parser.add_argument("--population", type=int, default=12, metavar="N", help="per tuned value (default: 12)")
     options = parser.parse_args(arguments)
     for option, low in (("seed", 0), ("generations", 1), ("population", 2)):

@@ -7,6 +7,7 @@ within a few milliseconds, and the page loads nothing from elsewhere.
 
 import contextlib
 import dataclasses
+import importlib.metadata
 import socket
 import time
 from collections import deque
@@ -31,15 +32,8 @@ HOST = "127.0.0.1"
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 PORT = 5006
 TASKS = {"force": "Force", "belt": "BeltSpeed"}
-OFF, FEEDBACK, AGENT, ROBUST, OPTIMUM, HAND = (
-    "off",
-    "velocity feedback",
-    "trained agent",
-    "trained agent, robust",
-    "optimum (nominal plant)",
-    "by hand",
-)
-CONTROLLERS = (OFF, FEEDBACK, AGENT, ROBUST, OPTIMUM, HAND)
+OFF, FEEDBACK, AGENT, ROBUST, HAND = "off", "velocity feedback", "trained agent", "trained agent, robust", "by hand"
+PLUGINS = "sd_friction_env.controllers"  # group of entry points: functions from an environment's id to a policy
 
 # Ranges of the sliders (parameters.RANGES allows more): first, last, step.
 SLIDERS: dict[str, tuple[str, float, float, float]] = {
@@ -57,6 +51,16 @@ _TRAIL, _HISTORY = 200, 600  # control intervals shown
 _TICK = 60  # milliseconds between frames
 _TICKS_A_READING = 4
 _CURVE_SPEEDS = np.linspace(0.005, 0.6, 48)
+
+
+def plugins() -> importlib.metadata.EntryPoints:
+    """Return the controllers that installed packages offer (entry points of the group ``PLUGINS``), by name."""
+    return importlib.metadata.entry_points(group=PLUGINS)
+
+
+def controllers() -> list[str]:
+    """Return the names of all controllers, plugins included."""
+    return [OFF, FEEDBACK, AGENT, ROBUST, *sorted(set(plugins().names)), HAND]
 
 
 # What moves -----------------------------------------------------------------------------------------------------------
@@ -126,11 +130,10 @@ class Live:
                 return load_pretrained(self.env_id)
             if controller == ROBUST:
                 return load_pretrained(self.env_id.replace("-v0", "Randomised-v0"))
-            if controller == OPTIMUM:
-                from agents.optimal import OptimalPolicy  # of the repository; an installed package has none
-
-                return OptimalPolicy.load(self.env_id)
-        except (ImportError, OSError, ValueError) as error:
+            if controller in plugins().names:
+                made: Policy = plugins()[controller].load()(self.env_id)
+                return made
+        except (AttributeError, ImportError, OSError, ValueError) as error:
             self.missing[controller] = f"{controller} is not there: {error}"
             return ZeroPolicy()
         return ConstantPolicy(self.hand) if controller == HAND else ZeroPolicy()
@@ -299,7 +302,7 @@ class Page:
             slider.on_change("value", self._moved(name))
         self.task = RadioButtonGroup(labels=["push the mass (force)", "drive the belt"], active=1, name="task")
         self.task.on_change("active", self._task_changed)
-        self.controller = Select(options=list(CONTROLLERS), value=OFF, title="controller", name="controller")
+        self.controller = Select(options=controllers(), value=OFF, title="controller", name="controller")
         self.controller.on_change("value", self._controller_changed)
         self.hand = Slider(title="by hand: action", start=-1, end=1, step=0.05, value=0, name="hand")
         self.hand.on_change("value", self._steered)

@@ -57,7 +57,7 @@ class Kind:
 
 
 def _linear(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
-    return LinearFeedback.from_env(env, values)
+    return LinearFeedback.from_env(env, values[:-1], values[-1])
 
 
 def _velocity(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
@@ -69,7 +69,7 @@ def _lqr(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
 
 
 def _filtered(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
-    return FilteredFeedback.from_env(env, x_gain=values[0], v_gain=values[1], pole=values[2])
+    return FilteredFeedback.from_env(env, x_gain=values[0], v_gain=values[1], pole=values[2], bias=values[3])
 
 
 def _filtered_sliding(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
@@ -89,16 +89,21 @@ def _sliding(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
 
 _GAIN = (-60.0, 60.0)
 _LAYER = (-4.0, 1.0)
+_BIAS = (-6.0, 6.0)
 KINDS: dict[str, Kind] = {
     "velocity feedback": Kind(_velocity, lambda env: {"gain": (-5.0, 5.0)}),
-    "linear state feedback": Kind(_linear, lambda env: dict.fromkeys(Readings.from_env(env).names, _GAIN)),
+    "linear state feedback": Kind(
+        _linear, lambda env: {**dict.fromkeys(Readings.from_env(env).names, _GAIN), "bias": _BIAS}
+    ),
     "LQR": Kind(_lqr, lambda env: {"log10 weight of x": (-4.0, 4.0), "log10 weight of the action": (-4.0, 4.0)}),
     "sliding mode": Kind(_sliding, lambda env: {"slope": (-3.0, 3.0), "log10 layer": _LAYER, "amplitude": (-1.0, 1.0)}),
     "delayed displacement feedback": Kind(
         _delayed, lambda env: {"gain": (-300.0, 300.0), "delay": (1.0, 100.0)}, needs_velocity=False, everywhere=True
     ),
     "linear feedback, velocity estimated": Kind(
-        _filtered, lambda env: {"x gain": _GAIN, "v gain": _GAIN, "pole": (0.0, 0.99)}, needs_velocity=False
+        _filtered,
+        lambda env: {"x gain": _GAIN, "v gain": _GAIN, "pole": (0.0, 0.99), "bias": _BIAS},
+        needs_velocity=False,
     ),
     "sliding mode, velocity estimated": Kind(
         _filtered_sliding,

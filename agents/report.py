@@ -663,6 +663,26 @@ class Report:
         run_rows = [row for comparison in self.comparisons.values() for row in comparison.runs]
         return over_tasks(run_rows, seed=self.seed, resamples=self.effort.resamples)
 
+    def summary(self) -> str:
+        """Return a Markdown table: for each task and tier a constant action, the best classical and the best learned
+        controller (by score), each with its score and, after it, its share of suppressed episodes."""
+        lines = ["| task, tier | constant -1 | best classical | best learned |", "|---|---|---|---|"]
+        for key, comparison in self.comparisons.items():
+            cells = []
+            for kind in ("baseline", "classical", "learned"):
+                those = [row for row in comparison.rows if row["kind"] == kind and row["score"] == row["score"]]
+                if kind == "baseline":
+                    those = [row for row in those if row["controller"] == "constant -1"]
+                if not those:
+                    cells.append("-")
+                    continue
+                best = max(those, key=lambda row: row["score"])
+                interval = f" [{best['score_low']:.3f}, {best['score_high']:.3f}]" if kind == "learned" else ""
+                name = "" if kind == "baseline" else f"{best['controller']}: "
+                cells.append(f"{name}{best['score']:.3f}{interval}, {best['suppressed']:.0%}")
+            lines.append(f"| {key[0]}, {key[1]} | {' | '.join(cells)} |")
+        return "\n".join(lines) + "\n"
+
     def html(self, origin: str) -> str:
         """Return the page; ``origin`` says at its foot what it was made with."""
         import jinja2
@@ -723,6 +743,7 @@ class Report:
             for name, table in tables.items():
                 table.metadata["made by"] = origin
                 table.to_csv(Path(place) / f"{name}.csv")
+            (Path(place) / "summary.md").write_text(self.summary(), encoding="utf-8")
             with atomic_file(Path(place) / "report.html") as file:
                 file.write(page)
             folder.mkdir(exist_ok=True)

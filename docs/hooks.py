@@ -1,7 +1,8 @@
 """What the documentation takes from elsewhere: figures, docstrings, the notebook, the changelog (hooks of MkDocs).
 
 Pages say where: ``<!-- docstring: NAME -->`` becomes a class's docstring, ``<!-- arguments: NAME -->``
-a table of a dataclass's fields with their defaults, ``<!-- ids -->`` the list of registered environments.
+a table of a dataclass's fields with their defaults, ``<!-- ids -->`` the list of registered environments,
+``<!-- include: PATH -->`` a file of the repository.
 
 The notebook is kept with its outputs: docs/renew_notebook.py.
 """
@@ -87,6 +88,7 @@ def expanded(markdown: str) -> str:
         lambda mark: inspect.getdoc(getattr(sd_friction_env, mark[1])) or "",
         markdown,
     )
+    markdown = re.sub(r"<!-- include: (\S+) -->", lambda mark: (ROOT / mark[1]).read_text(encoding="utf-8"), markdown)
     ids = "\n".join(f"- `{env_id}`" for env_id in sd_friction_env.ENVIRONMENT_IDS)
     return markdown.replace("<!-- ids -->", ids)
 

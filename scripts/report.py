@@ -3,6 +3,7 @@
     python scripts/report.py                               writes report_output/
     python scripts/report.py --task belt --tier nominal --out elsewhere
     python scripts/report.py --agents runs                 other trained agents, in folders TASK-TIER-ALGO-SEED
+    python scripts/report.py --publish                     and keep what the README shows of it in figures/
     python scripts/report.py --quick                       a few episodes and points: seconds, to see that it works
 
 Controllers: no control, constant actions, the tuned classical ones, the optimum where it is stored, and trained agents
@@ -12,6 +13,7 @@ Controllers: no control, constant actions, the tuned classical ones, the optimum
 import argparse
 import importlib.util
 import shlex
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -24,7 +26,9 @@ import sd_friction_env
 from scripts.figures import commit
 from scripts.train import TASKS, TIERS, Parser
 
-AGENTS = Path(__file__).parent.parent / "agents" / "pretrained"
+ROOT = Path(__file__).parent.parent
+AGENTS, FIGURES = ROOT / "agents" / "pretrained", ROOT / "figures"
+PUBLISHED = ("summary.md", "sweeps-belt.png", "sweeps-force.png")
 
 
 def make_parser() -> Parser:
@@ -36,6 +40,7 @@ def make_parser() -> Parser:
     parser.add_argument("--tier", nargs="+", choices=TIERS, default=list(TIERS), help="tiers (default: all three)")
     parser.add_argument("--agents", type=Path, metavar="FOLDER", help="of trained agents (default: agents/pretrained)")
     parser.add_argument("--out", type=Path, default=Path("report_output"), metavar="FOLDER", help="folder to write")
+    parser.add_argument("--publish", action="store_true", help="keep summary and sweeps in figures/ too")
     parser.add_argument("--quick", action="store_true", help="few episodes and points: no numbers to report")
     parser.add_argument("--seed", type=int, default=0, help="of the bootstraps (default: 0)")
     parser.add_argument("--no-progress", action="store_true", help="no progress bar")
@@ -46,6 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Make the report; return the exit status."""
     parser = make_parser()
     options = parser.parse_args(arguments)
+    if options.publish and options.quick:
+        parser.error("--publish and --quick exclude one another")
     if options.seed < 0:
         parser.error(f"--seed must be a whole number >= 0, got {options.seed}")
     out: Path = options.out
@@ -83,6 +90,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 bar.set_description(name)
                 work()
         files = made.write(out, origin)
+        if options.publish:
+            for name in PUBLISHED:
+                shutil.copyfile(out / name, FIGURES / f"control-{name}")
     except KeyboardInterrupt:
         print("\nreport.py: interrupted: nothing was written", file=sys.stderr)
         return 130

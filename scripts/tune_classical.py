@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if getattr(options, option) < low:
             parser.error(f"--{option} must be at least {low}, got {getattr(options, option)}")
     try:
-        gains = classical.stored_gains()
+        classical.stored_gains()
     except ValueError as error:
         parser.error(str(error))
     jobs = []
@@ -65,6 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     population=options.population,
                     progress=show,
                 )
+            gains = classical.stored_gains()  # as it is now: another process may have tuned other ones meanwhile
             gains.setdefault(env_id, {})[name] = {**found, "command": command}
             classical.store(gains)
             came_to = f"return {found['validation_return']:8.2f}, suppressed {found['suppressed']:4.0%}"

@@ -177,11 +177,12 @@ class Readings:
 
 @dataclass(frozen=True)
 class LinearFeedback:
-    """Saturated linear feedback: action = gains . (x - x_equilibrium, v, belt modulation), clipped to [-1, 1].
+    """Saturated linear feedback: action = bias + gains . (x - x_equilibrium, v, belt modulation), clipped to [-1, 1].
 
     Attributes:
         gains: action per unit of each quantity in ``readings.names``, each in [-1e6, 1e6].
         readings: of the environment to be controlled.
+        bias: action at the equilibrium, in [-1e6, 1e6].
 
     Raises:
         TypeError, ValueError: if there is not one such gain for each quantity observed.
@@ -189,8 +190,10 @@ class LinearFeedback:
 
     gains: tuple[float, ...]
     readings: Readings
+    bias: float = 0.0
 
     def __post_init__(self) -> None:
+        _check_numbers(self, {"bias": _GAINS})
         names = self.readings.names
         if len(self.gains) != len(names):
             raise ValueError(f"gains must be {len(names)} numbers, for {', '.join(names)}; got {self.gains!r}")
@@ -202,9 +205,9 @@ class LinearFeedback:
         object.__setattr__(self, "gains", gains)
 
     @classmethod
-    def from_env(cls, env: Any, gains: Sequence[float]) -> Self:
+    def from_env(cls, env: Any, gains: Sequence[float], bias: float = 0.0) -> Self:
         """Return the controller of an environment; see :class:`Readings`."""
-        return cls(tuple(gains), Readings.from_env(env))
+        return cls(tuple(gains), Readings.from_env(env), bias)
 
     def predict(
         self,
@@ -215,7 +218,7 @@ class LinearFeedback:
     ) -> tuple[Actions, State]:
         """Return the saturated feedback; see the module."""
         values = self.readings.read(observation)
-        action = np.zeros(values.shape[:-1])
+        action = np.full(values.shape[:-1], self.bias)
         # Summed one by one: a product of matrices may round differently for another size of the batch.
         for i, gain in enumerate(self.gains):
             action += gain * values[..., i]
@@ -267,11 +270,11 @@ class FilteredFeedback:
     """Saturated linear feedback of the position and of a velocity estimated from it, for sensors that see x alone.
 
     The estimate is the difference of two readings over the control interval, smoothed by a first-order filter:
-    w <- pole w + (1 - pole) (x - x_before)/control_interval; action = x_gain (x - x_equilibrium) + v_gain w, clipped
-    to [-amplitude, amplitude]. With a large ``v_gain`` it is a sliding mode with a boundary layer.
+    w <- pole w + (1 - pole) (x - x_before)/control_interval; action = bias + x_gain (x - x_equilibrium) + v_gain w,
+    clipped to [-amplitude, amplitude]. With a large ``v_gain`` it is a sliding mode with a boundary layer.
 
     Attributes:
-        x_gain, v_gain: action per unit, in [-1e6, 1e6].
+        x_gain, v_gain: action per unit, in [-1e6, 1e6]. bias: action at the equilibrium, in [-1e6, 1e6].
         pole: of the filter, in [0, 1); 0: no smoothing.
         amplitude: largest action, in [0, 1].
         control_interval: time between two readings.
@@ -286,10 +289,12 @@ class FilteredFeedback:
     pole: float
     control_interval: float
     readings: Readings
+    bias: float = 0.0
     amplitude: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_numbers(self, {"x_gain": _GAINS, "v_gain": _GAINS, "pole": (0.0, 0.999), "amplitude": (0.0, 1.0)})
+        _check_numbers(self, {"x_gain": _GAINS, "v_gain": _GAINS, "bias": _GAINS})
+        _check_numbers(self, {"pole": (0.0, 0.999), "amplitude": (0.0, 1.0)})
 
     @classmethod
     def from_env(cls, env: Any, **parameters: float) -> Self:
@@ -310,7 +315,7 @@ class FilteredFeedback:
         starts = _starts(episode_start, x)
         before, estimate = np.where(starts, x, before), np.where(starts, 0.0, estimate)
         estimate = self.pole * estimate + (1.0 - self.pole) * (x - before) / self.control_interval
-        action = np.clip(self.x_gain * x + self.v_gain * estimate, -self.amplitude, self.amplitude)
+        action = np.clip(self.bias + self.x_gain * x + self.v_gain * estimate, -self.amplitude, self.amplitude)
         return action.astype(np.float32)[..., None], (x, estimate)
 
 

@@ -96,6 +96,8 @@ def test_linear_feedback_weighs_physical_distances_from_the_equilibrium():
     action, _ = policy.predict(observe(env, place + 0.05, 0.04, 0.22))
     assert action == pytest.approx(2.0 * 0.05 - 3.0 * 0.04 + 0.5 * (0.1 / 0.5), abs=1e-6)
     assert policy.predict(observe(env, place + 5.0, 0.0, 0.2))[0].tolist() == [1.0]
+    biased, _ = LinearFeedback.from_env(env, (2.0, -3.0, 0.5), -0.3).predict(observe(env, place + 0.05, 0.04, 0.22))
+    assert biased == pytest.approx(action - 0.3, abs=1e-6)
 
 
 def test_feedback_reads_the_environments_own_observations():
@@ -158,13 +160,13 @@ def test_delayed_feedback_compares_with_the_reading_of_a_delay_ago():
 def test_filtered_feedback_estimates_the_velocity():
     env = make("SDFriction/ForceSensed-v0", control_interval=0.05)
     place = Readings.from_env(env).x_equilibrium
-    policy = FilteredFeedback.from_env(env, x_gain=0.5, v_gain=-2.0, pole=0.75, amplitude=0.9)
+    policy = FilteredFeedback.from_env(env, x_gain=0.5, v_gain=-2.0, pole=0.75, bias=0.05, amplitude=0.9)
     state, x, estimate = None, 0.0, 0.0
     for t, speed in enumerate((0.0, 0.1, 0.1, -0.3, 0.2, 9.0)):
         x += 0.05 * speed
         estimate = 0.75 * estimate + 0.25 * speed
         action, state = policy.predict(observe(env, place + x, 0.0)[:1], state, t == 0)
-        assert action == pytest.approx(max(-0.9, 0.5 * x - 2.0 * estimate), abs=1e-6)
+        assert action == pytest.approx(max(-0.9, 0.05 + 0.5 * x - 2.0 * estimate), abs=1e-6)
 
 
 @pytest.mark.parametrize("env_id", ["SDFriction/BeltSpeed-v0", "SDFriction/BeltSpeedSensed-v0"])

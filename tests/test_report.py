@@ -267,6 +267,8 @@ def test_the_page_holds_everything_and_needs_nothing(agents_folder, tmp_path, ca
     assert set(shown) >= {"passive", "constant -1", "constant +1", "PPO", "SAC", "optimum"}
     for name, row in shown.items():
         assert re.search(rf"<td>{re.escape(name)}</td><td>{row['score']:.3f}", page)
+    summary = (out / "summary.md").read_text().splitlines()
+    assert re.search(r"\| force, nominal \| -0\.\d+, 0% \| .+: 0\.\d+, \d+% \| .+: -?\d\.\d+", summary[2])
     assert "A quick look" in capsys.readouterr().out
     for name in ("runs", "sweeps", "learning", "histories", "training"):
         assert Table.from_csv(out / f"{name}.csv").n_rows >= 2

@@ -9,6 +9,7 @@ running.
 """
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 
@@ -48,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             jobs += [(env_id, name) for name in options.controller or allowed if name in allowed]
     if not jobs:
         parser.error(f"--controller {', '.join(options.controller)} cannot see what it needs in --tier {options.tier}")
-    command = " ".join(["python", "scripts/tune_classical.py", *(sys.argv[1:] if arguments is None else arguments)])
+    command = shlex.join(["python", "scripts/tune_classical.py", *(sys.argv[1:] if arguments is None else arguments)])
     try:
         for env_id, name in jobs:
             with tqdm(total=100, desc=f"{env_id}: {name}", unit="%", dynamic_ncols=True, leave=False) as bar:

@@ -36,6 +36,9 @@ Measurements = NDArray[np.float32]
 class Interface:
     """What a controller measures and commands, all dimensionless.
 
+    Where the plant's own belt speed is drawn anew for each episode, no constant tells what the belt's speed means: it
+    is then measured and commanded in units of the plant's nominal one (``v_belt/belt_speed``), which its operator sets.
+
     Attributes:
         names: of the measurements, in order. rest: what they are where all observations are zero; it fills the window
             of an episode that is younger than the window.
@@ -66,22 +69,28 @@ class Interface:
         assert task.x_scale is not None
         assert task.v_scale is not None
         names, offsets, scales = ["x"], [task.x_offset], [task.x_scale]
-        by_force = task.actuator == "force"
+        by_force, relative = task.actuator == "force", "belt_speed" in task.randomise
+        unit = 1.0 if relative else speed
         if task.sensor == "state":
             names, offsets, scales = [*names, "v"], [*offsets, 0.0], [*scales, task.v_scale]
             if not by_force:
-                names, offsets = [*names, "v_belt"], [*offsets, speed]
-                scales = [*scales, task.belt_authority * speed]
+                names = [*names, "v_belt/belt_speed" if relative else "v_belt"]
+                offsets, scales = [*offsets, unit], [*scales, task.belt_authority * unit]
         return cls(
             names=tuple(names),
             rest=tuple(offsets),
             offsets=tuple(offsets),
             scales=tuple(scales),
             limit=task.observation_limit,
-            command="force" if by_force else "target of the belt's speed",
-            command_offset=0.0 if by_force else speed,
-            command_scale=task.force_limit if by_force else task.belt_authority * speed,
+            command="force" if by_force else "target of the belt's speed" + relative * ", over its nominal speed",
+            command_offset=0.0 if by_force else unit,
+            command_scale=task.force_limit if by_force else task.belt_authority * unit,
         )
+
+    def measure(self, env: SDFrictionEnv, info: dict[str, Any]) -> NDArray[np.float64]:
+        """Return the true measurements, shape (k,), in an environment that has just returned ``info``."""
+        known = {**info, "v_belt/belt_speed": info["v_belt"] / env.parameters.belt_speed}
+        return np.array([known[name] for name in self.names])
 
     def observe(self, measurements: NDArray[Any]) -> NDArray[np.float32]:
         """Return the observations that the environment would show, for measurements of shape (..., k)."""
@@ -218,6 +227,40 @@ def worst_difference(model: onnx.ModelProto, policy: NetworkPolicy, env_id: str,
     for frame in range(policy.frames):  # shown one after the other, as an episode does
         expected, state = policy.predict(windows[:, frame], state, np.full(len(windows), frame == 0))
     return float(np.abs(actions - expected).max())
+
+
+def map_difference(env_id: str, n: int, seed: int = 0) -> float:
+    """Return the largest difference between what n true states of the environment are mapped to here, and what the
+    environment itself observes of them and applies to its belt or mass.
+
+    The sensor's noise and delay are left out: they belong to the plant, not to the map. Nothing of the environment's
+    observations enters the measurements, so that a wrong map cannot cancel out.
+    """
+    interface = Interface.of(evaluation.make_env(env_id))
+    env = evaluation.make_env(env_id, {"sensor_noise": 0.0, "sensor_delay": 0})
+    by_force, rng, worst, left = env.task.actuator == "force", np.random.default_rng(seed), 0.0, n
+    episodes = max(1, min(20, n))  # each of another plant, where they are drawn
+    for episode in range(episodes):
+        observation, info = env.reset(seed=int(rng.integers(2**31)))
+        relative = "belt_speed" in env.task.randomise
+        unit = 1.0 if by_force or not relative else env.parameters.belt_speed
+        for _ in range(-(-left // (episodes - episode))):
+            left -= 1
+            seen = interface.observe(interface.measure(env, info))
+            worst = max(worst, float(np.abs(seen - observation).max()))
+            action = rng.uniform(-1.0, 1.0, 1).astype(np.float32)
+            command = unit * (interface.command_offset + interface.command_scale * float(action[0]))
+            before = info["v_belt"]
+            observation, _, terminated, truncated, info = env.step(action)
+            if by_force:
+                worst = max(worst, abs(info["force"] - command))
+            else:
+                most = env.task.belt_acceleration_limit * env.task.control_interval
+                worst = max(worst, abs(info["v_belt"] - before - float(np.clip(command - before, -most, most))))
+            if terminated or truncated:
+                observation, info = env.reset(seed=int(rng.integers(2**31)))
+                unit = 1.0 if by_force or not relative else env.parameters.belt_speed
+    return worst
 
 
 def latency(model: onnx.ModelProto, measurements: Measurements, calls: int = 5000) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 """ONNX: the exported agent does what the agent does, from what is measured to what is commanded."""
 
+import dataclasses
 import itertools
 import json
 
@@ -18,6 +19,7 @@ from sd_friction_env import ENVIRONMENT_IDS
 from sd_friction_env.policies import NetworkPolicy
 from sd_friction_env.pretrained import pretrained_file
 
+RANDOMISED = "SDFriction/BeltSpeedRandomised-v0"
 FORCE, BELT, SENSED = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0", "SDFriction/BeltSpeedSensed-v0"
 
 
@@ -44,6 +46,26 @@ def test_the_model_acts_as_the_agent_on_ten_thousand_measurements(env_id, frames
     if frames > 1:
         # and young windows, zero but for what single precision makes of the measurements at rest
         assert (np.abs(observations[: 10_000 // 2, 0]) < 1e-7).all(axis=-1).any()
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENT_IDS)
+def test_measurements_and_commands_mean_what_the_environment_means_by_them(env_id):
+    assert export.map_difference(env_id, 2000) < export.TOLERANCE
+
+
+@pytest.mark.parametrize("wrong", [{"offsets": (0.82, 0.0, 0.2), "scales": (0.39, 0.1, 0.1)}, {"command_scale": 0.1}])
+def test_a_wrong_map_is_noticed(wrong, monkeypatch):
+    right = export.Interface.of(evaluation.make_env(RANDOMISED))
+    monkeypatch.setattr(export.Interface, "of", lambda env: dataclasses.replace(right, **wrong))
+    assert export.map_difference(RANDOMISED, 500) > 1e-3
+
+
+def test_where_the_plants_belt_speed_is_drawn_the_belt_is_told_relative_to_it():
+    model = export.build(network(RANDOMISED), evaluation.make_env(RANDOMISED))
+    said = {prop.key: prop.value for prop in model.metadata_props}
+    assert json.loads(said["measurements"]) == ["x", "v", "v_belt/belt_speed"]
+    assert said["command"] == "target of the belt's speed, over its nominal speed"
+    assert json.loads(said["young_window_is_filled_with"])[2] == 1.0
 
 
 def test_a_wrong_model_is_noticed():
@@ -142,6 +164,9 @@ def test_a_model_that_differs_is_not_written(tmp_path, monkeypatch, capsys):
         (["nothing.npz", "--out", "a.onnx"], "needs --task"),
         (["runs/nothing", "--out", "a.onnx"], "there is no run folder"),
         (["--task", "rope", "--out", "a.onnx"], "invalid choice: 'rope'"),
+        (["--tier", "sensed", "--out", "a.onnx"], "--tier sensed needs --task"),
+        (["--env-id", "SDFriction/Rope-v0", "--out", "a.onnx"], "--env-id must be one of"),
+        (["--env-id", FORCE, "--task", "force", "--out", "a.onnx"], "exclude one another"),
     ],
 )
 def test_the_script_refuses_what_cannot_be(arguments, message, tmp_path, monkeypatch, capsys):
@@ -160,7 +185,10 @@ def test_an_agent_of_another_task_is_refused(tmp_path, capsys):
     for command in (
         ["agents/pretrained/force-nominal-ppo-0", "--task", "belt", "--out", out],
         [str(pretrained_file(FORCE)), "--task", "belt", "--out", out],
+        [str(pretrained_file(SENSED)), "--task", "force", "--tier", "sensed", "--out", out],
+        [str(pretrained_file(FORCE)), "--env-id", "SDFriction/ForceRandomised-v0", "--out", out],
     ):
         with pytest.raises(SystemExit):
             script.main(command)
-        assert "trained on" in (error := capsys.readouterr().err) or "observes 2 values" in error
+        assert "was trained on" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -678,7 +678,8 @@ class Report:
                     continue
                 best = max(those, key=lambda row: row["score"])
                 interval = f" [{best['score_low']:.3f}, {best['score_high']:.3f}]" if kind == "learned" else ""
-                name = "" if kind == "baseline" else f"{best['controller']}: "
+                trained = f" ({best['runs']} run{'s' if best['runs'] > 1 else ''})" if kind == "learned" else ""
+                name = "" if kind == "baseline" else f"{best['controller']}{trained}: "
                 cells.append(f"{name}{best['score']:.3f}{interval}, {best['suppressed']:.0%}")
             lines.append(f"| {key[0]}, {key[1]} | {' | '.join(cells)} |")
         return "\n".join(lines) + "\n"

@@ -475,6 +475,8 @@ def _explore(options: argparse.Namespace) -> int:
 
     if not 0 <= options.port <= 65535:
         raise UsageError(f"--port must be in [0, 65535], got {options.port}")
+    if not options.host or ":" in options.host:
+        raise UsageError(f"--host must be a name or an IPv4 address, got {options.host!r}")
     explorer.require_bokeh()
     try:
         explorer.serve(options.host, options.port, browser=not options.no_browser, say=_say)
@@ -496,7 +498,9 @@ def _video(options: argparse.Namespace) -> int:
     if options.seed < 0:
         raise UsageError(f"--seed must be at least 0, got {options.seed}")
     video.check_video_path(options.out, options.fps)
-    checked_size(options.size)
+    width, height = checked_size(options.size)
+    if options.out.suffix.lower() == ".mp4" and (width % 2 or height % 2):
+        raise UsageError(f"--size must be even for .mp4, got {width} {height}")
     env_id = f"SDFriction/{_TASKS[options.task]}{_TIERS[options.tier]}-v0"
     policy, title = _agent(options, env_id)
     pictures = video.frames(

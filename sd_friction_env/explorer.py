@@ -12,6 +12,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,13 +24,13 @@ from sd_friction_env.basins import basin_grid
 from sd_friction_env.curves import amplitude_curve
 from sd_friction_env.env import SDFrictionEnv
 from sd_friction_env.orbits import LimitCycle, OrbitError, limit_cycle
-from sd_friction_env.parameters import GEOMETRIES, OscillatorParameters
+from sd_friction_env.parameters import GEOMETRIES, STATE_LIMIT, OscillatorParameters
 from sd_friction_env.plotting import BLACK, BLUE, GREEN, GREY, VERMILION
 from sd_friction_env.policies import ConstantPolicy, Policy, State, VelocityFeedback, ZeroPolicy
 from sd_friction_env.pretrained import load_pretrained
 
 HOST = "127.0.0.1"
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
+EVERYWHERE = "0.0.0.0"
 PORT = 5006
 TASKS = {"force": "Force", "belt": "BeltSpeed"}
 OFF, FEEDBACK, AGENT, ROBUST, HAND = "off", "velocity feedback", "trained agent", "trained agent, robust", "by hand"
@@ -50,6 +51,7 @@ _LONGEST = 1_000_000  # steps of an episode: nobody looks on for so long
 _TRAIL, _HISTORY = 200, 600  # control intervals shown
 _TICK = 60  # milliseconds between frames
 _TICKS_A_READING = 4
+BASIN_VIEW = ((-1.6, 1.6), (-1.2, 1.2))  # starts in x and in v
 _CURVE_SPEEDS = np.linspace(0.005, 0.6, 48)
 
 
@@ -123,6 +125,7 @@ class Live:
 
     def _policy(self, controller: str) -> Policy:
         """Return a controller by its name; one that is not there does nothing, and ``missing`` says why."""
+        self.missing.pop(controller, None)
         try:
             if controller == FEEDBACK:
                 return VelocityFeedback.from_env(gym.make(self.env_id), _GAIN)
@@ -133,15 +136,15 @@ class Live:
             if controller in plugins().names:
                 made: Policy = plugins()[controller].load()(self.env_id)
                 return made
-        except (AttributeError, ImportError, OSError, ValueError) as error:
+        except Exception as error:  # a plugin may raise anything
             self.missing[controller] = f"{controller} is not there: {error}"
             return ZeroPolicy()
         return ConstantPolicy(self.hand) if controller == HAND else ZeroPolicy()
 
     def choose_controller(self, controller: str) -> None:
-        """Switch the controller while the oscillator runs on; the comparison begins anew."""
-        self.controller = controller
+        """Switch the controller while the mass moves on; belt at its nominal speed, and the comparison begins anew."""
         self.rider.policy, self.rider.state, self.rider.begins = self._policy(controller), None, True
+        self.controller = controller
         if self.rider.observation is not None:
             self.restart(keep=True)
 
@@ -163,7 +166,7 @@ class Live:
     def restart(self, *, keep: bool = False) -> None:
         """Begin again on the passive cycle, or from where the mass is now."""
         options: dict[str, Any] = {"parameters": dataclasses.asdict(self.parameters)}
-        if keep and self.rider.info:
+        if keep and self.rider.info and max(abs(self.rider.info["x"]), abs(self.rider.info["v"])) <= STATE_LIMIT:
             options |= {"x": self.rider.info["x"], "v": self.rider.info["v"]}
         else:
             options["phase"] = 0.0
@@ -174,7 +177,7 @@ class Live:
     def advance(self, intervals: int) -> dict[str, list[float]]:
         """Let control intervals pass; return t, x, v, v_belt, action and stick (0 or 1) at the end of each.
 
-        A mass that loses contact is put back on its cycle.
+        A mass that loses contact is put back on its cycle; there is then nothing to return.
         """
         rows: dict[str, list[float]] = {name: [] for name in ("t", "x", "v", "v_belt", "action", "stick")}
         for _ in range(intervals):
@@ -187,7 +190,7 @@ class Live:
             rows["stick"].append(float(info["stick_fraction"] > 0.5))
             if any(ended):
                 self.restart()
-                break
+                return {name: [] for name in rows}
         return rows
 
     def costs(self) -> dict[str, float]:
@@ -215,17 +218,18 @@ class Live:
         table = amplitude_curve(self.parameters, speeds)
         return {"belt_speed": table["belt_speed"], "amplitude": table["amplitude"]}
 
-    def basins(self, x: tuple[float, float], v: tuple[float, float]) -> tuple[NDArray[np.float64], str]:
-        """Return where each start of a grid (120 by 80) ends, shape (80, 120): the number of its attractor, NaN where
-        contact is lost or it is not decided; and in words what there is."""
-        _, _, found = basin_grid(self.parameters, x, v, (120, 80))
-        words = []
-        for i, cycle in enumerate(found.attractors):
-            place = 0.5 * (cycle.x_max + cycle.x_min)
-            words.append(
-                f"{found.fraction(i)[0]:.0%} of the starts: {cycle.kind} round {place:.2f}, A = {cycle.amplitude:.3f}"
-            )
-        return np.where(found.labels >= 0, found.labels, np.nan).astype(float), "<br>".join(words)
+
+def basin_picture(parameters: OscillatorParameters) -> tuple[NDArray[np.float64], str]:
+    """Return where each start of a grid over ``BASIN_VIEW`` ends, shape (80, 120): the number of its attractor, NaN
+    where contact is lost or it is not decided; and in words what there is."""
+    _, _, found = basin_grid(parameters, *BASIN_VIEW, (120, 80))
+    words = []
+    for i, cycle in enumerate(found.attractors):
+        place = 0.5 * (cycle.x_max + cycle.x_min)
+        words.append(
+            f"{found.fraction(i)[0]:.0%} of the starts: {cycle.kind} round {place:.2f}, A = {cycle.amplitude:.3f}"
+        )
+    return np.where(found.labels >= 0, found.labels, np.nan).astype(float), "<br>".join(words)
 
 
 # The page -------------------------------------------------------------------------------------------------------------
@@ -269,6 +273,8 @@ class Page:
             Toggle,
         )
 
+        self.document = document
+        self.pool = ThreadPoolExecutor(1)  # compiled code lets the server go on meanwhile
         self.live = Live()
         self.style = InlineStyleSheet(css=_STYLE)
         self.speed = 4  # control intervals a tick
@@ -298,8 +304,10 @@ class Page:
             for name, (title, low, high, step) in SLIDERS.items()
         }
         self.sliders["belt_speed"].format = "0.000"
+        self.plant_widgets: dict[str, Any] = {**self.sliders, "geometry": self.geometry}
         for name, slider in self.sliders.items():
             slider.on_change("value", self._moved(name))
+        self.several = False  # widgets are being set together
         self.task = RadioButtonGroup(labels=["push the mass (force)", "drive the belt"], active=1, name="task")
         self.task.on_change("active", self._task_changed)
         self.controller = Select(options=controllers(), value=OFF, title="controller", name="controller")
@@ -419,8 +427,11 @@ class Page:
 
     def _moved(self, name: str) -> Callable[[str, Any, Any], None]:
         def moved(attribute: str, old: Any, new: Any) -> None:
+            if self.several:
+                return
             with self._said():
-                self.live.change(**{name: new})
+                # All that the widgets show, for what was refused before may now fit.
+                self.live.change(**{name: widget.value for name, widget in self.plant_widgets.items()})
                 self._plant_changed()
 
         return moved
@@ -428,9 +439,9 @@ class Page:
     @contextlib.contextmanager
     def _said(self) -> Any:
         """Show on the page what cannot be, instead of raising it."""
+        self.message.text = ""
         try:
             yield
-            self.message.text = ""
         except (ValueError, OrbitError) as error:
             self.message.text = f"<div class='warn'>{error}</div>"
 
@@ -438,13 +449,18 @@ class Page:
         with self._said():
             self.live.choose_task(list(TASKS)[new])
             self._clear()
+        self._tell_missing()
 
     def _controller_changed(self, attribute: str, old: str, new: str) -> None:
         with self._said():
             self.live.choose_controller(new)
             self._clear()
-        if new in self.live.missing:
-            self.message.text = f"<div class='warn'>{self.live.missing[new]}</div>"
+        self._tell_missing()
+
+    def _tell_missing(self) -> None:
+        chosen = self.live.controller
+        if chosen in self.live.missing:
+            self.message.text = f"<div class='warn'>{self.live.missing[chosen]}</div>"
 
     def _steered(self, attribute: str, old: float, new: float) -> None:
         if self.controller.value != HAND:
@@ -464,27 +480,30 @@ class Page:
 
     def _nominal(self) -> None:
         nominal = OscillatorParameters()
+        self.several = True
+        for name, widget in self.plant_widgets.items():
+            widget.value = getattr(nominal, name)
+        self.several = False
         with self._said():
             self.live.change(**dataclasses.asdict(nominal))
-        self.geometry.value = nominal.geometry
-        for name, slider in self.sliders.items():
-            slider.value = getattr(nominal, name)
-        self._plant_changed()
+            self._plant_changed()
 
     def _show_basins(self) -> None:
-        words = ""
+        plant = self.live.parameters
+        self.message.text = "The basins are being computed ..."
+        work = self.pool.submit(basin_picture, plant)
+        work.add_done_callback(
+            lambda done: self.document.add_next_tick_callback(lambda: self._basins_there(plant, done))
+        )
+
+    def _basins_there(self, plant: OscillatorParameters, work: Future[tuple[NDArray[np.float64], str]]) -> None:
+        if plant != self.live.parameters:  # it has been changed meanwhile
+            return
         with self._said():
-            x, v = (-1.6, 1.6), (-1.2, 1.2)
-            image, words = self.live.basins(x, v)
-            self._look(0.0, x[1], v[1])
-            self.basins.data = {
-                "image": [image],
-                "x": [x[0]],
-                "y": [v[0]],
-                "dw": [x[1] - x[0]],
-                "dh": [v[1] - v[0]],
-            }
-        if words:
+            image, words = work.result()
+            (x, x_end), (v, v_end) = BASIN_VIEW
+            self._look(0.0, x_end, v_end)
+            self.basins.data = {"image": [image], "x": [x], "y": [v], "dw": [x_end - x], "dh": [v_end - v]}
             self.message.text = words
 
     # What follows
@@ -520,10 +539,10 @@ class Page:
         if self.pause.active:
             return
         live = self.live
-        before = live.steps
         rows = live.advance(self.speed)
-        if live.steps < before:  # contact was lost, and it begins anew
+        if not rows["t"]:  # it has begun anew
             self._clear()
+            return
         for name, values in rows.items():
             self.past[name].extend(values)
         # Time runs from the right: axes that stay as they are need no new layout, most of the work of a frame.
@@ -544,14 +563,20 @@ class Page:
         self.ticks += 1
         if self.ticks % _TICKS_A_READING:
             return
+
+        def shown_as(value: float, form: str) -> str:
+            return format(value, form) if np.isfinite(value) else "-"
+
         state = "<span class='stick'>■ sticks</span>" if sticks else "<span class='slip'>▲ slips</span>"
         costs = "".join(
             f"<tr><td>{name}</td><td class='number'>{cost:.3f}</td></tr>" for name, cost in live.costs().items()
         )
+        passive, saved = shown_as(self.passive, ".3f"), shown_as(live.share(), ".0%")
         self.readout.text = (
-            f"<span class='big'>{state}</span> &nbsp; t = {live.steps * 0.1:.0f}<br>amplitude <b>{amplitude:.3f}</b> "
-            f"(passive {self.passive:.3f})<table><tr><td>mean cost of a step, from one start</td><td></td></tr>{costs}"
-            f"<tr><td>saved, of what the agent saves</td><td class='number'>{live.share():.0%}</td></tr></table>"
+            f"<span class='big'>{state}</span> &nbsp; t = {live.steps * 0.1:.0f}<br>"
+            f"amplitude <b>{amplitude:.3f}</b> (passive {passive})"
+            f"<table><tr><td>mean cost of a step, from one start</td><td></td></tr>{costs}"
+            f"<tr><td>saved, of what the agent saves</td><td class='number'>{saved}</td></tr></table>"
         )
 
     def _draw_machine(self, x: float, v_belt: float, force: float, travel: float, color: str) -> None:
@@ -599,14 +624,12 @@ def serve(host: str = HOST, port: int = PORT, *, browser: bool = True, say: Call
     begun = time.perf_counter()
     live.curve()
     took = time.perf_counter() - begun
-    name = f"[{host}]" if ":" in host else host
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.create_server((host, port), family=family) as free:  # a taken one is told here, before anything starts
+    with socket.create_server((host, port)) as free:  # a taken one is told here, before anything starts
         port = free.getsockname()[1]
     # Pages of other sites must not drive the explorer of somebody who only looks at them.
-    places = [f"{name}:{port}", f"localhost:{port}"] if host in LOOPBACK else ["*"]
+    places = ["*"] if host == EVERYWHERE else [f"{host}:{port}", f"localhost:{port}"]
     server = Server({"/": Application(FunctionHandler(Page))}, address=host, port=port, allow_websocket_origin=places)
-    address = f"http://{'localhost' if host in ('0.0.0.0', '::') else name}:{server.port}/"
+    address = f"http://{'localhost' if host == EVERYWHERE else host}:{server.port}/"
     server.start()
     say(f"The explorer is at {address} (a curve takes {1e3 * took:.0f} ms); Ctrl-C ends it.")
     if browser:

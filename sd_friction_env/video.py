@@ -117,7 +117,7 @@ def write_video(
         progress: told how many frames are written.
 
     Raises:
-        ValueError, ImportError: as :func:`check_video_path`.
+        ValueError, ImportError: as :func:`check_video_path`. OSError: if it cannot be written.
     """
     target = check_video_path(path, fps)
     import imageio.v2 as imageio
@@ -129,6 +129,10 @@ def write_video(
         if target.suffix.lower() == ".gif"
         else {"fps": fps, "macro_block_size": 2, "codec": "libx264", "quality": 7, "ffmpeg_log_level": "error"}
     )
+    try:
+        unfinished.touch()  # told before imageio opens anything
+    except OSError as error:
+        raise OSError(f"{os.fspath(path)!r}: {error.strerror}") from None
     try:
         writer: Any = imageio.get_writer(unfinished, **options)
         with writer:

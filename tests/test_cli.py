@@ -171,6 +171,7 @@ def test_a_video_shows_any_agent_that_fits(tmp_path, capsys):
         ("--task force --out film.gif --fps 61", "--fps must be in [1, 60], got 61"),
         ("--task force --out film.gif --fps 51", "fps must be in [1, 50] for a GIF, got 51"),
         ("--task force --out film.gif --size 10 10", "render_size width must be"),
+        ("--task force --out film.mp4 --size 321 240", "--size must be even for .mp4, got 321 240"),
         ("--task force --out film.gif --seed -1", "--seed must be at least 0, got -1"),
         ("--task force --out film.gif --agent someone", "or a policy.npz, got 'someone'"),
         ("--task force --out film.gif --agent none.npz", "none.npz"),

@@ -13,7 +13,7 @@ from bokeh.document import Document
 from scripts import explorer_latency
 from sd_friction_env import OscillatorParameters, amplitude_curve, explorer, limit_cycle, load_pretrained
 from sd_friction_env.cli import main
-from sd_friction_env.explorer import AGENT, FEEDBACK, HAND, OFF, ROBUST, Live, Page, controllers
+from sd_friction_env.explorer import AGENT, FEEDBACK, HAND, OFF, ROBUST, Live, Page, basin_picture, controllers
 
 
 def test_what_runs_is_the_environment_under_the_agent():
@@ -97,8 +97,7 @@ def test_a_changed_plant_is_the_plant_that_is_shown():
 
 
 def test_basins_tell_where_starts_end():
-    live = Live("force", OscillatorParameters(alpha=0.2))
-    image, words = live.basins((-1.6, 1.6), (-1.2, 1.2))
+    image, words = basin_picture(OscillatorParameters(alpha=0.2))
     assert image.shape == (80, 120)
     found = np.unique(image[np.isfinite(image)])
     assert found.tolist() == list(range(len(found)))
@@ -109,8 +108,11 @@ def test_a_mass_that_loses_contact_is_put_back():
     live = Live("force", OscillatorParameters(geometry="cubic", alpha=0.9))
     live.rider.start({"parameters": {"geometry": "cubic", "alpha": 0.9}, "x": 9.0, "v": 0.0})
     rows = live.advance(50)
-    assert 1 <= len(rows["t"]) < 50
+    assert rows["t"] == []  # what came before is of the past
     assert abs(live.rider.info["x"]) < 3.0
+    live.rider.info |= {"x": 11.0}  # on its way out: a changed plant must not start there
+    live.change(beta=0.06)
+    assert live.parameters.beta == live.rider.env.parameters.beta == 0.06
 
 
 def test_an_agent_that_is_not_there_is_told(monkeypatch):
@@ -135,14 +137,18 @@ def test_the_page_follows_its_widgets():
     page.sliders["mu_m"].value = 0.3  # above mu_s: refused in words, and all goes on
     assert "mu_m" in page.message.text
     page.tick()
-    page.sliders["mu_m"].value = 0.05
+    page.sliders["mu_s"].value = 0.4  # now it fits
     assert page.message.text == ""
+    assert (page.live.parameters.mu_m, page.live.parameters.mu_s) == (0.3, 0.4)
+    page.sliders["mu_m"].value, page.sliders["mu_s"].value = 0.05, 0.2
     page.geometry.value = "cubic"
     assert page.live.parameters.geometry == "cubic"
     page._nominal()
     assert page.live.parameters == OscillatorParameters()
     assert page.sliders["alpha"].value == 0.8
+    page.document.add_next_tick_callback = lambda callback: callback()
     page._show_basins()
+    page.pool.shutdown()
     assert "of the starts" in page.message.text
     page._take_over(1.0)
     assert page.controller.value == HAND
@@ -153,9 +159,50 @@ def test_the_page_follows_its_widgets():
     assert len(page.path.data["t"]) > 0
 
 
+def test_the_page_goes_on_when_an_episode_ends(monkeypatch):
+    monkeypatch.setattr(explorer, "_LONGEST", 8)
+    page = Page(Document())
+    for _ in range(12):
+        page.tick()
+        assert (np.diff(page.path.data["t"]) > 0.0).all()
+        assert len(page.path.data["t"]) <= 8
+    assert np.isfinite(page.point.data["amplitude"]).all()
+
+
+def test_a_page_without_a_cycle_shows_no_nan():
+    page = Page(Document())
+    page.sliders["belt_speed"].value = 0.6
+    for _ in range(60):
+        page.tick()
+    assert "nan" not in page.readout.text
+
+
+def test_a_plugin_that_fails_is_told_and_forgotten(monkeypatch):
+    class Failing:
+        names = ("broken",)
+
+        def __getitem__(self, name):
+            return self
+
+        def load(self):
+            raise KeyError("anything")
+
+    monkeypatch.setattr(explorer, "plugins", Failing)
+    live = Live("force")
+    live.choose_controller("broken")
+    assert "anything" in live.missing["broken"]
+    assert live.advance(2)["action"] == [0.0, 0.0]
+    live.choose_controller(AGENT)
+    assert AGENT not in live.missing
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [("--port 70000", "--port must be in [0, 65535], got 70000"), ("--host no.such.host.invalid", "cannot listen")],
+    [
+        ("--host ::1", "--host must be a name or an IPv4 address, got '::1'"),
+        ("--port 70000", "--port must be in [0, 65535], got 70000"),
+        ("--host no.such.host.invalid", "cannot listen"),
+    ],
 )
 def test_the_command_refuses_what_cannot_be(arguments, message, capsys):
     assert main(["explore", "--no-browser", *arguments.split()]) == 2

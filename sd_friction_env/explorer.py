@@ -49,8 +49,10 @@ SLIDERS: dict[str, tuple[str, float, float, float]] = {
 _GAIN = 1.5
 _LONGEST = 1_000_000  # steps of an episode: nobody looks on for so long
 _TRAIL, _HISTORY = 200, 600  # control intervals shown
+_LAP = 100  # control intervals of which the amplitude is taken: a little more than a cycle of the nominal plant
 _TICK = 60  # milliseconds between frames
 _TICKS_A_READING = 4
+_LEAST_SAVED = 0.02  # a step
 BASIN_VIEW = ((-1.6, 1.6), (-1.2, 1.2))  # starts in x and in v
 _CURVE_SPEEDS = np.linspace(0.005, 0.6, 48)
 
@@ -155,7 +157,7 @@ class Live:
             self.rider.policy = ConstantPolicy(self.hand)
 
     def change(self, **values: Any) -> None:
-        """Change parameters of the plant; the mass goes on from where it is.
+        """Change parameters of the plant; the mass goes on from where it is, on a belt at its nominal speed.
 
         Raises:
             ValueError: if they do not fit together; nothing is then changed.
@@ -200,9 +202,10 @@ class Live:
         return {name: -value / n for name, value in earned.items()}
 
     def share(self) -> float:
-        """Return how much of what the trained agent saves is saved now: 0 as without control, 1 as the agent."""
+        """Return how much of what the trained agent saves is saved now: 0 as without control, 1 as the agent; NaN where
+        it has next to nothing to save."""
         now, without, agent = self.costs().values()
-        return (without - now) / (without - agent) if without > agent else float("nan")
+        return (without - now) / (without - agent) if without > agent + _LEAST_SAVED else float("nan")
 
     # What does not move
 
@@ -325,7 +328,7 @@ class Page:
         basins.on_click(self._show_basins)
         self.pause = Toggle(label="pause", name="pause")
         self.readout = Div(name="readout", stylesheets=[self.style], width=330, height=160)
-        self.message = Div(name="message", stylesheets=[self.style], width=330)
+        self.message = Div(name="message", stylesheets=[self.style], width=500)
         title = Div(
             text="<span class='big'>Stick, slip, and what control does about it</span><br>A mass on a spring rides a "
             "moving belt. Friction that falls with speed makes it squeal. Stop it, by a small force or by the belt's "
@@ -343,10 +346,9 @@ class Page:
             *self.sliders.values(),
             self.geometry,
             row(nominal, basins, width=330),
-            self.message,
             width=340,
         )
-        middle = column(self._machine(), self._portrait())
+        middle = column(self._machine(), self._portrait(), self.message)
         right = column(self._history(), self._amplitudes())
         document.add_root(column(title, row(left, middle, right, spacing=12)))
         document.title = "sd_friction_env explorer"
@@ -556,10 +558,12 @@ class Page:
         self.mass.data = {"x": [x], "v": [v], "color": [color]}
         self.line.data = {"x": [-5.0, 5.0], "v": [v_belt, v_belt]}
         self._draw_machine(x, v_belt, float(info["force"]), live.rider.env.get_state().belt_travel, color)
-        lap = shown["x"][-_TRAIL // 2 :]
-        amplitude = 0.5 * float(np.ptp(lap)) if len(lap) else float("nan")
+        lap = shown["x"][-_LAP:]
+        whole = len(lap) == _LAP  # of a part of a cycle it would be too small: as if the vibration were suppressed
+        amplitude = 0.5 * float(np.ptp(lap)) if whole else float("nan")
         speed = live.parameters.belt_speed
-        self.point.data = {"belt_speed": [speed], "amplitude": [amplitude], "color": [GREEN]}
+        point = {"belt_speed": [speed], "amplitude": [amplitude], "color": [GREEN]}
+        self.point.data = point if whole else {name: [] for name in point}
         self.ticks += 1
         if self.ticks % _TICKS_A_READING:
             return
@@ -574,7 +578,7 @@ class Page:
         passive, saved = shown_as(self.passive, ".3f"), shown_as(live.share(), ".0%")
         self.readout.text = (
             f"<span class='big'>{state}</span> &nbsp; t = {live.steps * 0.1:.0f}<br>"
-            f"amplitude <b>{amplitude:.3f}</b> (passive {passive})"
+            f"amplitude <b>{shown_as(amplitude, '.3f')}</b> (passive {passive})"
             f"<table><tr><td>mean cost of a step, from one start</td><td></td></tr>{costs}"
             f"<tr><td>saved, of what the agent saves</td><td class='number'>{saved}</td></tr></table>"
         )

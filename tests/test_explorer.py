@@ -196,6 +196,20 @@ def test_a_plugin_that_fails_is_told_and_forgotten(monkeypatch):
     assert AGENT not in live.missing
 
 
+def test_the_amplitude_is_of_whole_cycles():
+    page = Page(Document())
+    passive = limit_cycle(OscillatorParameters()).amplitude
+    shown = []
+    for _ in range(60):
+        page.tick()
+        shown += list(page.point.data["amplitude"])
+    assert len(shown) > 20
+    assert shown == pytest.approx([passive] * len(shown), rel=0.01)
+    page._restarted()
+    page.tick()
+    assert len(page.point.data["amplitude"]) == 0  # a few points are no cycle, however close together
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -256,6 +270,7 @@ def test_in_a_browser_a_slider_moves_the_curve(page):
 
 def test_in_a_browser_the_agent_suppresses_and_a_picture_is_made(page, tmp_path):
     page.get_by_text("squeal again").click()
+    page.wait_for_function("Bokeh.documents[0].get_model_by_name('point').data.amplitude[0] > 0.35", timeout=60_000)
     page.locator("select").first.select_option(AGENT)
     page.wait_for_function("Bokeh.documents[0].get_model_by_name('point').data.amplitude[0] < 0.02", timeout=60_000)
     picture = tmp_path / "explorer.png"

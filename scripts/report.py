@@ -51,8 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Make the report; return the exit status."""
     parser = make_parser()
     options = parser.parse_args(arguments)
-    if options.publish and options.quick:
-        parser.error("--publish and --quick exclude one another")
+    partial = options.quick or options.agents is not None or {*options.task} != {*TASKS} or {*options.tier} != {*TIERS}
+    if options.publish and partial:
+        parser.error("--publish keeps the whole report: leave out --quick, --agents, --task and --tier")
     if options.seed < 0:
         parser.error(f"--seed must be a whole number >= 0, got {options.seed}")
     out: Path = options.out

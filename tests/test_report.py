@@ -343,3 +343,11 @@ def test_the_time_to_a_score_is_that_of_the_first_evaluation_that_reaches_it(tmp
     assert (row["seconds"], row["steps"], row["run"]) == (5.0, 40.0, "force-nominal-ppo-0")
     (never,) = report.training_times([dataclasses.replace(agent, evaluations=curve)], passive=-110.0, optimum=-5.0)
     assert np.isnan(never["seconds_to_0.95"])
+
+
+@pytest.mark.parametrize("part", [["--quick"], ["--task", "belt"], ["--tier", "nominal"], ["--agents", "runs"]])
+def test_only_a_whole_report_is_published(part, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        script.main(["--publish", "--out", str(tmp_path / "out"), *part])
+    assert "--publish keeps the whole report" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

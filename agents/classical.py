@@ -288,4 +288,7 @@ def classical_controllers(env_id: str, path: Path | None = None) -> dict[str, Po
     found = stored_gains(path).get(env_id)
     if not found:
         raise ValueError(f"no tuned controllers are stored for {env_id!r}: run scripts/tune_classical.py")
-    return {name: build(name, env_id, list(entry["values"].values())) for name, entry in found.items()}
+    return {
+        name: build(name, env_id, [entry["values"][key] for key in KINDS[name].bounds(_nominal_env(env_id))])
+        for name, entry in found.items()
+    }

@@ -613,7 +613,11 @@ class Report:
         self._keep(f"history-{name}", draw_histories(self.histories[key]), caption)
         mine = [row for row in self.learning if (row["task"], row["tier"]) == key]
         if mine:
-            marks = {row["controller"]: row["return"] for row in rows if row["kind"] == "optimum"}
+            marks = {
+                row["controller"]: row["return"]
+                for row in rows
+                if row["kind"] == "optimum" and row["scored_episodes"] == rows[0]["episodes"]
+            }
             caption = f"Learning, {words}: interquartile mean over runs, and the band from the least to the greatest."
             for score in REACHED:
                 times = [row[f"seconds_to_{score:g}"] for row in self.training if (row["task"], row["tier"]) == key]
@@ -665,7 +669,8 @@ class Report:
 
     def summary(self) -> str:
         """Return a Markdown table: for each task and tier a constant action, the best classical and the best learned
-        controller (by score), each with its score and, after it, its share of suppressed episodes."""
+        controller (by score, of the learned ones with the most runs), each with its score and, after it, its share of
+        suppressed episodes."""
         lines = ["| task, tier | constant -1 | best classical | best learned |", "|---|---|---|---|"]
         for key, comparison in self.comparisons.items():
             cells = []
@@ -676,7 +681,8 @@ class Report:
                 if not those:
                     cells.append("-")
                     continue
-                best = max(those, key=lambda row: row["score"])
+                most = max(row["runs"] for row in those)  # one run may be a lucky one
+                best = max((row for row in those if row["runs"] == most), key=lambda row: row["score"])
                 interval = f" [{best['score_low']:.3f}, {best['score_high']:.3f}]" if kind == "learned" else ""
                 trained = f" ({best['runs']} run{'s' if best['runs'] > 1 else ''})" if kind == "learned" else ""
                 name = "" if kind == "baseline" else f"{best['controller']}{trained}: "

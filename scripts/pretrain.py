@@ -60,8 +60,8 @@ def train(name: str, algorithm: str, seed: int) -> str:
 
 def best_run(name: str) -> tuple[Path, dict[str, Any]] | None:
     """Return the run of a task and tier that did best on its validation episodes, and its configuration."""
-    found = [(folder, runs.load_config(folder)) for folder in sorted(PRETRAINED.glob(f"{name}-*-[0-9]*"))]
-    found = [(folder, config) for folder, config in found if not folder.name.endswith(runs.PARTIAL)]
+    folders = sorted(PRETRAINED.glob(f"{name}-*-[0-9]*"))
+    found = [(folder, runs.load_config(folder)) for folder in folders if not folder.name.endswith(runs.PARTIAL)]
     return max(found, key=lambda entry: entry[1]["best"]["credited_return"], default=None)
 
 

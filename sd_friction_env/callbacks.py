@@ -34,7 +34,8 @@ class AnnealedExploration(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         policy: Any = self.model.policy
-        left = float(self.model._current_progress_remaining)
+        # Not Stable-Baselines3's own progress: that of the last learn() stands there until the first rollout is over.
+        left = 1.0 - self.model.num_timesteps / self.model._total_timesteps
         with torch.no_grad():
             policy.log_std.fill_(left * self.start + (1.0 - left) * self.end)
 

@@ -416,7 +416,8 @@ def _check_numbers(controller: Any, ranges: Mapping[str, tuple[float, float]]) -
 
 
 def _starts(episode_start: ArrayLike | None, like: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return np.broadcast_to(np.asarray(False if episode_start is None else episode_start, dtype=bool), like.shape)
+    starts = np.asarray(False if episode_start is None else episode_start, dtype=bool)
+    return np.broadcast_to(starts.reshape(()) if like.ndim == 0 and starts.size == 1 else starts, like.shape)
 
 
 # Networks -------------------------------------------------------------------------------------------------------------

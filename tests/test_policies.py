@@ -153,7 +153,7 @@ def test_delayed_feedback_compares_with_the_reading_of_a_delay_ago():
     # the first three compare with the first reading
     expected = [2.0 * (places[max(t - 3, 0)] - x) for t, x in enumerate(places)]
     assert actions == pytest.approx(np.clip(expected, -1.0, 1.0), abs=1e-6)
-    again, _ = policy.predict(observe(env, 0.7, 0.0), state, True)
+    again, _ = policy.predict(observe(env, 0.7, 0.0), state, np.array([True]))  # as Stable-Baselines3 gives it
     assert again == 0.0  # a new episode knows nothing of the last one
 
 

@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from sd_friction_env import kernel
 from sd_friction_env.orbits import stick_intervals
-from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_choice, checked_number
+from sd_friction_env.parameters import (
+    EXCITATIONS,
+    STATE_LIMIT,
+    OscillatorParameters,
+    checked_choice,
+    checked_number,
+)
 from sd_friction_env.rendering import checked_size
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.startup import announced
@@ -95,6 +101,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | position | (x - x_offset) / x_scale | always |
     | velocity | v / v_scale | sensor `state` |
     | belt modulation | (v_belt / belt_speed - 1) / belt_authority | sensor `state` and actuator `belt_speed` |
+    | phases | cosine and sine of each excitation's phase: force, ripple, stiffness | `show_phases` |
     | parameters | each randomised one, its range scaled to [-1, 1], by name | `show_parameters` |
 
     ## Rewards
@@ -131,8 +138,8 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     `parameters` (an :class:`OscillatorParameters` or a mapping of its fields), `render_mode`, `render_size` (width and
     height of a frame in pixels), `reward`, and every field of :class:`Task`: `actuator`, `force_limit`,
     `belt_authority`, `belt_acceleration_limit`, `control_interval`, `episode_steps`, `w_effort`, `w_stick`, `start`,
-    `kick`, `randomise`, `show_parameters`, `sensor`, `sensor_noise`, `sensor_delay`, `contact_loss_cost`,
-    `observation_limit`, `x_offset`, `x_scale`, `v_scale`.
+    `kick`, `randomise`, `show_parameters`, `show_phases`, `sensor`, `sensor_noise`, `sensor_delay`,
+    `contact_loss_cost`, `observation_limit`, `x_offset`, `x_scale`, `v_scale`.
 
     ```python
     import gymnasium as gym
@@ -165,8 +172,8 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise TypeError(f"reward must be a function of the info dictionary or None, got {reward!r}")
         if task.randomise:  # whatever an episode may draw must be legal
             corner = {name: low for name, (low, _) in task.randomise.items()}
-            if "mu_m" in corner:
-                corner["mu_m"] = task.randomise["mu_m"][1]  # the greatest, beside the least mu_s
+            for name in {"mu_m", "mu_k"} & corner.keys():
+                corner[name] = task.randomise[name][1]  # the greatest, beside the least mu_s
             check_belt(self.nominal.replace(**corner))
         self.render_mode = render_mode
         self.render_size = checked_size(render_size)
@@ -174,6 +181,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         with announced("orbits"):
             self.task = task.with_scales(self.nominal)
         sees = (task.sensor == "state") + (task.sensor == "state" and task.actuator == "belt_speed")
+        sees += 2 * len(EXCITATIONS) if task.show_phases else 0
         shows = len(task.randomise) if task.show_parameters else 0
         limit = self.task.observation_limit
         self.observation_space = spaces.Box(-limit, limit, (1 + sees + shows,), np.float32)
@@ -239,12 +247,13 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._seen = self._observations[0]
 
     def __getstate__(self) -> dict[str, Any]:
-        views = ("_numbers", "_codes", "_state", "_integers", "_past", "_shown", "_seen")
+        views = ("_numbers", "_codes", "_state", "_integers", "_past", "_shown", "_seen", "_step_alone")
         return {name: value for name, value in vars(self).items() if name not in views}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._look_into_memory()  # a copied view would look into no one's memory
+        self._choose_step()
 
     @property
     def parameters(self) -> OscillatorParameters:
@@ -254,13 +263,18 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _use(self, parameters: OscillatorParameters) -> None:
         """Begin anew with these parameters, the belt at its nominal speed."""
         self._parameters = parameters
-        geometry, *numbers = parameters.plant
+        geometry, *numbers, _ = parameters.plant
+        self._choose_step()
         self._integers[kernel.I_GEOMETRY] = geometry
         self._state[: kernel.S_BELT_SPEED, 0] = numbers
         self._state[kernel.S_BELT_SPEED] = parameters.belt_speed
+        self._state[kernel.S_FRICTION : kernel.STATE_ROWS, 0] = parameters.laws(0.0)[1:-1]
         kernel.blank_episodes(self._state, self._integers, (0,))
         if self.task.show_parameters:
             self._shown[0] = self.task.shown_parameters(dataclasses.asdict(parameters))
+
+    def _choose_step(self) -> None:
+        self._step_alone = kernel.step_alone_beyond if self._parameters.beyond else kernel.step_alone
 
     def _observe(self) -> NDArray[np.float32]:
         arrays = (self._numbers, self._codes, self._state, self._integers, self._past, self._shown)
@@ -293,8 +307,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._integers[kernel.I_KEY], self._integers[kernel.I_EPISODE] = key, episode
         self._state[kernel.S_X], self._state[kernel.S_V] = x, v
         self._running = True
-        v_belt = parameters.belt_speed
-        self._mode = kernel.mode_of(parameters.plant, x, v, v_belt, 0.0, 0.0)
+        self._mode, v_belt, v_rel, normal_force = kernel.left_alone(parameters.plant, x, v, parameters.belt_speed)
         self.clear_picture()
         if self.render_mode == "human":
             self.render()
@@ -302,9 +315,9 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             "x": x,
             "v": v,
             "v_belt": v_belt,
-            "v_rel": v - v_belt,
+            "v_rel": v_rel,
             "mode": self._mode,
-            "normal_force": kernel.spring(parameters.plant, x)[1],
+            "normal_force": normal_force,
             "time": 0.0,
             "parameters": dataclasses.asdict(parameters),
         }
@@ -353,7 +366,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             reward,
             terminated,
             truncated,
-        ) = kernel.step_alone(self._memory, self._observations, a)
+        ) = self._step_alone(self._memory, self._observations, a)
         info["action"] = a
         if status != kernel.OK:
             self._running = False
@@ -395,7 +408,8 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         write_state(state, self._state, self._integers, self._past, 0)
         self._key = state.key
         self._running = not state.ended
-        self._mode = kernel.mode_of(state.parameters.plant, state.x, state.v, state.v_belt, 0.0, 0.0)
+        plant = kernel.later(state.parameters.plant, state.steps * self.task.control_interval)
+        self._mode = kernel.mode_of(plant, state.x, state.v, state.v_belt, 0.0, 0.0)
 
     def note_for_picture(self, x_min: float, x_max: float, stick_fraction: float, force: float) -> None:
         """Remember what an interval came to for the readouts of :meth:`render`."""
@@ -434,7 +448,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer = Renderer(self.render_mode, *self.render_size, fps=self.metadata["render_fps"])
         p, task = self._parameters, self.task
         x, v, v_belt, belt_travel = self._state[kernel.S_X : kernel.S_TRAVEL + 1, 0].tolist()
-        intervals = stick_intervals(p.replace(belt_speed=v_belt)) if v_belt >= 0.0 else []
+        intervals = stick_intervals(p.unexcited.replace(belt_speed=v_belt)) if v_belt >= 0.0 else []
         interval = min(intervals, key=lambda ends: abs(0.5 * (ends[0] + ends[1]) - x), default=None)
         lows, highs, sticks = zip(*self._window, strict=True) if self._window else ((x,), (x,), (0.0,))
         by_belt = task.belt_authority * p.belt_speed if task.actuator == "belt_speed" else 0.0
@@ -488,6 +502,7 @@ def task_arrays(task: Task) -> tuple[FloatArray, IntegerArray]:
     codes[kernel.T_FULL_STATE] = task.sensor == "state"
     codes[kernel.T_SEES_BELT] = task.sensor == "state" and task.actuator == "belt_speed"
     codes[kernel.T_SENSOR_DELAY] = task.sensor_delay
+    codes[kernel.T_SEES_PHASES] = task.show_phases
     return numbers, codes
 
 
@@ -599,7 +614,7 @@ def start_of(
 ) -> tuple[float, float]:
     """Return the (x, v) at which an episode starts that is reset with (checked) options."""
     if "x" in options:
-        return options["x"], options.get("v", parameters.belt_speed)
+        return options["x"], options.get("v", parameters.first_belt_speed)
     if "phase" in options:
         return task.cycle_state(parameters, options["phase"])
     if "start" in options:

@@ -25,7 +25,8 @@ compiled = numba.njit(cache=True, error_model="numpy", nogil=True)
 in_threads = numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 in_lanes = numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 
-EXACT, CUBIC, LINEAR = 0, 1, 2
+EXACT, CUBIC, LINEAR, DUFFING, DISCONTINUOUS = 0, 1, 2, 3, 4
+STRIBECK, COULOMB, HYPERBOLIC, EXPONENTIAL = 0, 1, 2, 3
 
 # The mode is the sign of v_rel, frozen until an event.
 SLIP_BACKWARD, STICK, SLIP_FORWARD = -1, 0, 1
@@ -33,6 +34,7 @@ SLIP_BACKWARD, STICK, SLIP_FORWARD = -1, 0, 1
 OK, CONTACT_LOST, EVENT_LIMIT, STEP_LIMIT = 0, 1, 2, 3
 
 NO_EVENT, RESTICK, CROSSING, GRAZING, BREAKAWAY, CONTACT_LOSS, TURNING, LANDING, STUCK_STEP = 0, 1, 2, 3, 4, 5, 6, 7, 8
+SWITCHING = 9
 
 STATUS_NAMES = {OK: "ok", CONTACT_LOST: "contact lost", EVENT_LIMIT: "event limit", STEP_LIMIT: "step limit"}
 EVENT_NAMES = {
@@ -42,6 +44,7 @@ EVENT_NAMES = {
     BREAKAWAY: "breakaway",
     CONTACT_LOSS: "contact-loss",
     STUCK_STEP: "step-limit",
+    SWITCHING: "switching",
 }
 
 FORCE, BELT_SPEED = 0, 1
@@ -55,12 +58,42 @@ MAX_EVENTS = 256  # in one call of advance
 NOTHING_KNOWN = (0.0,) * 18  # of a slip that begins
 V_REL_ZERO = 1e-14  # relative velocities this small cannot be told from zero after one step's rounding
 TIME_ZERO = 1e-13  # events are located this closely in time
+HUGE_EXPONENT = 700.0  # a trial step across the surface may ask for more, and is refused anyway
+ROUNDING = 1e-14  # of a sum of forces, relative to the greatest of them
+SIDE_ZERO = 1e-14  # x this small is on neither side of zero
 LAST_STRETCH = 1e-5  # of a step: a Taylor step of this length is exact to rounding
 STEP_DOUBLING = 1.0 / 1024.0  # a step this far inside the rule doubles: the error falls as h^8, four times the margin
 
 
+class Laws(NamedTuple):
+    """What a plant has beyond the paper's: another friction law, the Duffing spring, the discontinuous limit alpha = 0,
+    excitation. :class:`Plant` has it, or None: numba compiles the kernel for each, and what stands under ``is None``
+    below is not there in the other.
+    """
+
+    side: float  # of x = 0 where the field is frozen, for alpha = 0; 0: by x
+    friction: int
+    mu_k: float  # kinetic (Coulomb) or least (exponential)
+    decay: float  # delta of the hyperbolic law, v_0 of the exponential one
+    mu_v: float
+    kappa: float
+    force: float  # excitation: force cos(force_rate time + force_phase)
+    force_rate: float
+    force_phase: float
+    ripple: float  # the belt's speed is greater by ripple cos(ripple_rate time + ripple_phase)
+    ripple_rate: float
+    ripple_phase: float
+    depth: float  # the spring's force is 1 + depth cos(depth_rate time + depth_phase) times as great
+    depth_rate: float
+    depth_phase: float
+    time: float  # at the beginning of a call
+
+
+NO_LAWS = Laws(0.0, STRIBECK, *(0.0,) * 14)
+
+
 class Plant(NamedTuple):
-    """What the equations of motion need: Eq. 4's geometry and damping, Eq. 5's friction law."""
+    """What the equations of motion need: Eq. 4's geometry and damping, Eq. 5's friction law, and what is beyond."""
 
     geometry: int
     alpha: float
@@ -69,14 +102,202 @@ class Plant(NamedTuple):
     mu_s: float
     k1: float
     k3: float
+    laws: Laws | None = None
+
+
+# What a plant may have beyond the paper's ---------------------------------------------------------------------------
+#
+# Time is the plant's: `later` gives the plant as it is after a time t. With a ripple on the belt, slip and stick are
+# reckoned in the frame that moves with the ripple: x - integral of it, v - ripple. There the belt's motion is the plain
+# one, and v_rel is what it was. `room_x` and `room_v` lead back. Without laws all these are the identity, and cost
+# nothing.
+
+
+@compiled
+def _later(plant, laws, t):
+    if laws is None:
+        return plant
+    return _with_laws(plant, laws, laws.side, laws.time + t)
+
+
+@compiled
+def _with_laws(plant, laws, side, time):
+    new = Laws(
+        side,
+        laws.friction,
+        laws.mu_k,
+        laws.decay,
+        laws.mu_v,
+        laws.kappa,
+        laws.force,
+        laws.force_rate,
+        laws.force_phase,
+        laws.ripple,
+        laws.ripple_rate,
+        laws.ripple_phase,
+        laws.depth,
+        laws.depth_rate,
+        laws.depth_phase,
+        time,
+    )
+    return Plant(plant.geometry, plant.alpha, plant.g1, plant.beta, plant.mu_s, plant.k1, plant.k3, new)
+
+
+@compiled
+def later(plant, t):
+    """Return the plant as it is after a time t."""
+    return _later(plant, plant.laws, t)
+
+
+@compiled
+def _ripple(laws):
+    """Return the ripple's way, speed, acceleration and jerk."""
+    if laws.ripple == 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    rate = laws.ripple_rate
+    angle = rate * laws.time + laws.ripple_phase
+    c = laws.ripple * math.cos(angle)
+    s = laws.ripple * math.sin(angle)
+    return s / rate, c, -rate * s, -rate * rate * c
+
+
+@compiled
+def _excitation(laws):
+    """Return the exciting force and its rate of change."""
+    if laws.force == 0.0:
+        return 0.0, 0.0
+    angle = laws.force_rate * laws.time + laws.force_phase
+    return laws.force * math.cos(angle), -laws.force * laws.force_rate * math.sin(angle)
+
+
+@compiled
+def _stiffness(laws):
+    """Return the factor of the spring's force and its rate of change."""
+    if laws.depth == 0.0:
+        return 1.0, 0.0
+    angle = laws.depth_rate * laws.time + laws.depth_phase
+    return 1.0 + laws.depth * math.cos(angle), -laws.depth * laws.depth_rate * math.sin(angle)
+
+
+@compiled
+def _room_x(laws, x):
+    if laws is None:
+        return x
+    return x + _ripple(laws)[0] if laws.ripple != 0.0 else x
+
+
+@compiled
+def _room_v(laws, v):
+    if laws is None:
+        return v
+    return v + _ripple(laws)[1] if laws.ripple != 0.0 else v
+
+
+@compiled
+def _room_a(laws, a):
+    if laws is None:
+        return a
+    return a + _ripple(laws)[2] if laws.ripple != 0.0 else a
+
+
+@compiled
+def room_x(plant, x):
+    """Return where a mass at x in the ripple's frame is."""
+    return _room_x(plant.laws, x)
+
+
+@compiled
+def room_v(plant, v):
+    """Return how fast a mass of velocity v in the ripple's frame is."""
+    return _room_v(plant.laws, v)
+
+
+@compiled
+def _into_frame(laws, x, v, v_belt):
+    if laws is None:
+        return x, v
+    if laws.ripple == 0.0:
+        return x, v
+    way, speed, _, _ = _ripple(laws)
+    v = v - speed
+    return x - way, v_belt if abs(v - v_belt) <= V_REL_ZERO else v
+
+
+@compiled
+def _frame_v(laws, v):
+    if laws is None:
+        return v
+    return v - _ripple(laws)[1] if laws.ripple != 0.0 else v
+
+
+@compiled
+def _driven(laws, u):
+    if laws is None:
+        return u
+    if laws.force != 0.0:
+        u = u + _excitation(laws)[0]
+    if laws.ripple != 0.0:
+        u = u - _ripple(laws)[2]
+    return u
+
+
+@compiled
+def _faced(plant, laws, x, v):
+    if laws is None:
+        return plant
+    if plant.geometry != DISCONTINUOUS or laws.side != 0.0:
+        return plant
+    if abs(x) > SIDE_ZERO:
+        return _with_laws(plant, laws, 1.0 if x > 0.0 else -1.0, laws.time)
+    if v == 0.0:
+        return plant
+    return _with_laws(plant, laws, 1.0 if v > 0.0 else -1.0, laws.time)
+
+
+@compiled
+def faced(plant, x, v):
+    """Return the plant with its field frozen to the side of x = 0 on which a mass is, or, from 0, to which it moves."""
+    return _faced(plant, plant.laws, room_x(plant, x), room_v(plant, v))
 
 
 # Laws -------------------------------------------------------------------------------------------------------------
 
 
 @compiled
+def _spring_beyond(plant, laws, x):
+    if laws is None:
+        return x, plant.g1
+    if plant.geometry == DUFFING:
+        # Reference [8] of the paper: R = x + kappa x^3, N = g1
+        return x + laws.kappa * (x * x * x), plant.g1
+    if plant.geometry == DISCONTINUOUS:
+        # Eq. 4 with alpha = 0: R = x - sgn(x), N = g1; R(0) = 0 for a mass that does not move
+        side = laws.side
+        if side == 0.0 and x != 0.0:
+            side = 1.0 if x > 0.0 else -1.0
+        return x - side, plant.g1
+    return x, plant.g1
+
+
+@compiled
+def _modulated(plant, laws, restoring, normal):
+    if laws is None:
+        return restoring, normal
+    if laws.depth == 0.0:
+        return restoring, normal
+    factor = _stiffness(laws)[0]
+    return restoring * factor, plant.g1 + (normal - plant.g1) * factor
+
+
+@compiled
 def spring(plant, x):
     """Return the restoring force R(x) and the normal force N(x)."""
+    restoring, normal = _spring(plant, x)
+    return _modulated(plant, plant.laws, restoring, normal)
+
+
+@compiled
+def _spring(plant, x):
     if plant.geometry == EXACT:
         # Eq. 4: R = x (1 - 1/sqrt(x^2 + alpha^2)), N = g1 - alpha (1 - 1/sqrt(x^2 + alpha^2))
         stretch = 1.0 - 1.0 / math.sqrt(x * x + plant.alpha * plant.alpha)
@@ -86,12 +307,35 @@ def spring(plant, x):
         y = x / plant.alpha
         return x - y + 0.5 * (y * y * y), plant.g1 - plant.alpha + 1.0 - 0.5 * (y * y)
     # Reference [1] of the paper: R = x, N = g1
-    return x, plant.g1
+    return _spring_beyond(plant, plant.laws, x)
+
+
+@compiled
+def _slopes_beyond(plant, laws, x):
+    if laws is None:
+        return 1.0, 0.0
+    return (1.0 + 3.0 * laws.kappa * (x * x) if plant.geometry == DUFFING else 1.0), 0.0
+
+
+@compiled
+def _modulated_pair(laws, first, second):
+    if laws is None:
+        return first, second
+    if laws.depth == 0.0:
+        return first, second
+    factor = _stiffness(laws)[0]
+    return first * factor, second * factor
 
 
 @compiled
 def spring_slopes(plant, x):
     """Return R'(x) and N'(x)."""
+    restoring_slope, normal_slope = _spring_slopes(plant, x)
+    return _modulated_pair(plant.laws, restoring_slope, normal_slope)
+
+
+@compiled
+def _spring_slopes(plant, x):
     if plant.geometry == EXACT:
         length = math.sqrt(x * x + plant.alpha * plant.alpha)
         cube = length * length * length
@@ -99,12 +343,12 @@ def spring_slopes(plant, x):
     if plant.geometry == CUBIC:
         y = x / plant.alpha
         return 1.0 - (1.0 - 1.5 * (y * y)) / plant.alpha, -y / plant.alpha
-    return 1.0, 0.0
+    return _slopes_beyond(plant, plant.laws, x)
 
 
 @compiled
 def spring_curvatures(plant, x):
-    """Return R''(x) and N''(x)."""
+    """Return R''(x) and N''(x), the stiffness unmodulated."""
     if plant.geometry == EXACT:
         square = plant.alpha * plant.alpha
         length = math.sqrt(x * x + square)
@@ -113,7 +357,14 @@ def spring_curvatures(plant, x):
     if plant.geometry == CUBIC:
         square = plant.alpha * plant.alpha
         return 3.0 * x / (square * plant.alpha), -1.0 / square
-    return 0.0, 0.0
+    return _curvature_beyond(plant, plant.laws, x), 0.0
+
+
+@compiled
+def _curvature_beyond(plant, laws, x):
+    if laws is None:
+        return 0.0
+    return 6.0 * laws.kappa * x if plant.geometry == DUFFING else 0.0
 
 
 @compiled
@@ -125,27 +376,69 @@ def potential(plant, x):
     if plant.geometry == CUBIC:
         y = x / plant.alpha
         return 0.5 * (x * x) - 0.5 * (x * y) + 0.125 * (x * y * y * y)
+    return _potential_beyond(plant, plant.laws, x)
+
+
+@compiled
+def _potential_beyond(plant, laws, x):
+    if laws is None:
+        return 0.5 * (x * x)
+    if plant.geometry == DUFFING:
+        return 0.5 * (x * x) + 0.25 * laws.kappa * (x * x * x * x)
+    if plant.geometry == DISCONTINUOUS:
+        return 0.5 * (x * x) - abs(x)
     return 0.5 * (x * x)
 
 
 @compiled
 def friction_coefficient(plant, mode, v_rel):
-    """Return mu(v_rel) with its sign frozen to ``mode``, Eq. 5 (with x' - v_b in the linear term, as Eq. 6 has it)."""
+    """Return mu(v_rel) with its sign frozen to ``mode``, Eq. 5 (with x' - v_b in the linear term, as Eq. 6 has it), or
+    that of another law."""
+    return _friction_coefficient(plant, plant.laws, mode, v_rel)
+
+
+@compiled
+def _friction_coefficient(plant, laws, mode, v_rel):
+    if laws is None:
+        return mode * plant.mu_s - plant.k1 * v_rel + plant.k3 * (v_rel * v_rel * v_rel)
+    if laws.friction == COULOMB:
+        return mode * laws.mu_k
+    if laws.friction == HYPERBOLIC:
+        return mode * plant.mu_s / (1.0 + laws.decay * (mode * v_rel))
+    if laws.friction == EXPONENTIAL:
+        fall = math.exp(min(-(mode * v_rel) / laws.decay, HUGE_EXPONENT))
+        return mode * (laws.mu_k + (plant.mu_s - laws.mu_k) * fall) + laws.mu_v * v_rel
     return mode * plant.mu_s - plant.k1 * v_rel + plant.k3 * (v_rel * v_rel * v_rel)
 
 
 @compiled
 def friction_slope(plant, mode, v_rel):
     """Return mu'(v_rel)."""
+    return _friction_slope(plant, plant.laws, mode, v_rel)
+
+
+@compiled
+def _friction_slope(plant, laws, mode, v_rel):
+    if laws is None:
+        return -plant.k1 + 3.0 * plant.k3 * (v_rel * v_rel)
+    if laws.friction == COULOMB:
+        return 0.0
+    if laws.friction == HYPERBOLIC:
+        # mode^2 = 1 in slip
+        below = 1.0 + laws.decay * (mode * v_rel)
+        return -plant.mu_s * laws.decay / (below * below)
+    if laws.friction == EXPONENTIAL:
+        fall = math.exp(min(-(mode * v_rel) / laws.decay, HUGE_EXPONENT))
+        return -(plant.mu_s - laws.mu_k) / laws.decay * fall + laws.mu_v
     return -plant.k1 + 3.0 * plant.k3 * (v_rel * v_rel)
 
 
 @compiled
 def slip_forces(plant, mode, x, v, v_belt, u):
     """Return the acceleration in slip (Eq. 7 with a control force u) and the contact force -mu N in it."""
-    restoring, normal = spring(plant, x)
+    restoring, normal = spring(plant, room_x(plant, x))
     contact = -friction_coefficient(plant, mode, v - v_belt) * normal
-    return contact - 2.0 * plant.beta * v - restoring + u, contact
+    return contact - 2.0 * plant.beta * room_v(plant, v) - restoring + _driven(plant.laws, u), contact
 
 
 @compiled
@@ -154,8 +447,10 @@ def stick_load(plant, x, v_belt, a_belt, u):
 
     Eq. 8 as it must read: |a_belt + 2 beta v_belt + R(x) - u| <= mu_s N(x).
     """
-    restoring, normal = spring(plant, x)
-    return a_belt + 2.0 * plant.beta * v_belt + restoring - u, plant.mu_s * normal
+    plant = faced(plant, x, v_belt)
+    restoring, normal = spring(plant, room_x(plant, x))
+    load = a_belt + 2.0 * plant.beta * room_v(plant, v_belt) + restoring - _driven(plant.laws, u)
+    return load, plant.mu_s * normal
 
 
 @compiled
@@ -170,6 +465,12 @@ def mode_at_zero_v_rel(plant, x, v_belt, a_belt, u):
 @compiled
 def mode_of(plant, x, v, v_belt, a_belt, u):
     """Return the mode of a state: the sign of v_rel, or what the stick cone says where v_rel is zero."""
+    x, v = _into_frame(plant.laws, x, v, v_belt)
+    return _mode_of(plant, x, v, v_belt, a_belt, u)
+
+
+@compiled
+def _mode_of(plant, x, v, v_belt, a_belt, u):
     if v < v_belt:
         return SLIP_BACKWARD
     if v > v_belt:
@@ -276,38 +577,38 @@ def _slip_step(plant, mode, x, v, v_belt, dv_belt, u, h):
     a1, f1 = slip_forces(plant, mode, x, v, v_belt, u)
     v2 = v + h * (_A2_1 * a1)
     x2 = x + h * (_A2_1 * v1)
-    a2, f2 = slip_forces(plant, mode, x2, v2, v_belt + _C2 * dv_belt, u)
+    a2, f2 = slip_forces(later(plant, _C2 * h), mode, x2, v2, v_belt + _C2 * dv_belt, u)
     v3 = v + h * (_A3_1 * a1 + _A3_2 * a2)
     x3 = x + h * (_A3_1 * v1 + _A3_2 * v2)
-    a3, f3 = slip_forces(plant, mode, x3, v3, v_belt + _C3 * dv_belt, u)
+    a3, f3 = slip_forces(later(plant, _C3 * h), mode, x3, v3, v_belt + _C3 * dv_belt, u)
     v4 = v + h * (_A4_1 * a1 + _A4_3 * a3)
     x4 = x + h * (_A4_1 * v1 + _A4_3 * v3)
-    a4, f4 = slip_forces(plant, mode, x4, v4, v_belt + _C4 * dv_belt, u)
+    a4, f4 = slip_forces(later(plant, _C4 * h), mode, x4, v4, v_belt + _C4 * dv_belt, u)
     v5 = v + h * (_A5_1 * a1 + _A5_3 * a3 + _A5_4 * a4)
     x5 = x + h * (_A5_1 * v1 + _A5_3 * v3 + _A5_4 * v4)
-    a5, f5 = slip_forces(plant, mode, x5, v5, v_belt + _C5 * dv_belt, u)
+    a5, f5 = slip_forces(later(plant, _C5 * h), mode, x5, v5, v_belt + _C5 * dv_belt, u)
     v6 = v + h * (_A6_1 * a1 + _A6_4 * a4 + _A6_5 * a5)
     x6 = x + h * (_A6_1 * v1 + _A6_4 * v4 + _A6_5 * v5)
-    a6, f6 = slip_forces(plant, mode, x6, v6, v_belt + _C6 * dv_belt, u)
+    a6, f6 = slip_forces(later(plant, _C6 * h), mode, x6, v6, v_belt + _C6 * dv_belt, u)
     v7 = v + h * (_A7_1 * a1 + _A7_4 * a4 + _A7_5 * a5 + _A7_6 * a6)
     x7 = x + h * (_A7_1 * v1 + _A7_4 * v4 + _A7_5 * v5 + _A7_6 * v6)
-    a7, f7 = slip_forces(plant, mode, x7, v7, v_belt + _C7 * dv_belt, u)
+    a7, f7 = slip_forces(later(plant, _C7 * h), mode, x7, v7, v_belt + _C7 * dv_belt, u)
     v8 = v + h * (_A8_1 * a1 + _A8_4 * a4 + _A8_5 * a5 + _A8_6 * a6 + _A8_7 * a7)
     x8 = x + h * (_A8_1 * v1 + _A8_4 * v4 + _A8_5 * v5 + _A8_6 * v6 + _A8_7 * v7)
-    a8, f8 = slip_forces(plant, mode, x8, v8, v_belt + _C8 * dv_belt, u)
+    a8, f8 = slip_forces(later(plant, _C8 * h), mode, x8, v8, v_belt + _C8 * dv_belt, u)
     v9 = v + h * (_A9_1 * a1 + _A9_4 * a4 + _A9_5 * a5 + _A9_6 * a6 + _A9_7 * a7 + _A9_8 * a8)
     x9 = x + h * (_A9_1 * v1 + _A9_4 * v4 + _A9_5 * v5 + _A9_6 * v6 + _A9_7 * v7 + _A9_8 * v8)
-    a9, f9 = slip_forces(plant, mode, x9, v9, v_belt + _C9 * dv_belt, u)
+    a9, f9 = slip_forces(later(plant, _C9 * h), mode, x9, v9, v_belt + _C9 * dv_belt, u)
     v10 = v + h * (_A10_1 * a1 + _A10_4 * a4 + _A10_5 * a5 + _A10_6 * a6 + _A10_7 * a7 + _A10_8 * a8 + _A10_9 * a9)
     x10 = x + h * (_A10_1 * v1 + _A10_4 * v4 + _A10_5 * v5 + _A10_6 * v6 + _A10_7 * v7 + _A10_8 * v8 + _A10_9 * v9)
-    a10, f10 = slip_forces(plant, mode, x10, v10, v_belt + _C10 * dv_belt, u)
+    a10, f10 = slip_forces(later(plant, _C10 * h), mode, x10, v10, v_belt + _C10 * dv_belt, u)
     v11 = v + h * (
         _A11_1 * a1 + _A11_4 * a4 + _A11_5 * a5 + _A11_6 * a6 + _A11_7 * a7 + _A11_8 * a8 + _A11_9 * a9 + _A11_10 * a10
     )
     x11 = x + h * (
         _A11_1 * v1 + _A11_4 * v4 + _A11_5 * v5 + _A11_6 * v6 + _A11_7 * v7 + _A11_8 * v8 + _A11_9 * v9 + _A11_10 * v10
     )
-    a11, f11 = slip_forces(plant, mode, x11, v11, v_belt + _C11 * dv_belt, u)
+    a11, f11 = slip_forces(later(plant, _C11 * h), mode, x11, v11, v_belt + _C11 * dv_belt, u)
     v12 = v + h * (
         _A12_1 * a1
         + _A12_4 * a4
@@ -330,28 +631,36 @@ def _slip_step(plant, mode, x, v, v_belt, dv_belt, u, h):
         + _A12_10 * v10
         + _A12_11 * v11
     )
-    a12, f12 = slip_forces(plant, mode, x12, v12, v_belt + _C12 * dv_belt, u)
+    a12, f12 = slip_forces(later(plant, _C12 * h), mode, x12, v12, v_belt + _C12 * dv_belt, u)
     v_end = v + h * (_B1 * a1 + _B6 * a6 + _B7 * a7 + _B8 * a8 + _B9 * a9 + _B10 * a10 + _B11 * a11 + _B12 * a12)
     x_end = x + h * (_B1 * v1 + _B6 * v6 + _B7 * v7 + _B8 * v8 + _B9 * v9 + _B10 * v10 + _B11 * v11 + _B12 * v12)
+    w1 = room_v(plant, v1)
+    w6 = room_v(later(plant, _C6 * h), v6)
+    w7 = room_v(later(plant, _C7 * h), v7)
+    w8 = room_v(later(plant, _C8 * h), v8)
+    w9 = room_v(later(plant, _C9 * h), v9)
+    w10 = room_v(later(plant, _C10 * h), v10)
+    w11 = room_v(later(plant, _C11 * h), v11)
+    w12 = room_v(later(plant, _C12 * h), v12)
     int_v2 = h * (
-        _B1 * (v1 * v1)
-        + _B6 * (v6 * v6)
-        + _B7 * (v7 * v7)
-        + _B8 * (v8 * v8)
-        + _B9 * (v9 * v9)
-        + _B10 * (v10 * v10)
-        + _B11 * (v11 * v11)
-        + _B12 * (v12 * v12)
+        _B1 * (w1 * w1)
+        + _B6 * (w6 * w6)
+        + _B7 * (w7 * w7)
+        + _B8 * (w8 * w8)
+        + _B9 * (w9 * w9)
+        + _B10 * (w10 * w10)
+        + _B11 * (w11 * w11)
+        + _B12 * (w12 * w12)
     )
     int_fv = h * (
-        _B1 * (f1 * v1)
-        + _B6 * (f6 * v6)
-        + _B7 * (f7 * v7)
-        + _B8 * (f8 * v8)
-        + _B9 * (f9 * v9)
-        + _B10 * (f10 * v10)
-        + _B11 * (f11 * v11)
-        + _B12 * (f12 * v12)
+        _B1 * (f1 * w1)
+        + _B6 * (f6 * w6)
+        + _B7 * (f7 * w7)
+        + _B8 * (f8 * w8)
+        + _B9 * (f9 * w9)
+        + _B10 * (f10 * w10)
+        + _B11 * (f11 * w11)
+        + _B12 * (f12 * w12)
     )
     e5x = _E5_1 * v1 + _E5_6 * v6 + _E5_7 * v7 + _E5_8 * v8 + _E5_9 * v9 + _E5_10 * v10 + _E5_11 * v11 + _E5_12 * v12
     e5v = _E5_1 * a1 + _E5_6 * a6 + _E5_7 * a7 + _E5_8 * a8 + _E5_9 * a9 + _E5_10 * a10 + _E5_11 * a11 + _E5_12 * a12
@@ -383,11 +692,44 @@ def _dips(gap, slope, gap_end, slope_end, h):
 @compiled
 def slip_jerk(plant, mode, x, v, v_belt, a_belt, a):
     """Return the rate of change of the acceleration a in slip, under a held force."""
-    restoring_slope, normal_slope = spring_slopes(plant, x)
     v_rel = v - v_belt
+    x = room_x(plant, x)
+    w = room_v(plant, v)
+    restoring_slope, normal_slope = spring_slopes(plant, x)
     contact = friction_slope(plant, mode, v_rel) * (a - a_belt) * spring(plant, x)[1]
-    contact = contact + friction_coefficient(plant, mode, v_rel) * normal_slope * v
-    return -contact - 2.0 * plant.beta * a - restoring_slope * v
+    contact = contact + friction_coefficient(plant, mode, v_rel) * normal_slope * w
+    jerk = -contact - 2.0 * plant.beta * _room_a(plant.laws, a) - restoring_slope * w
+    return _aging_jerk(plant, plant.laws, mode, x, v_rel, jerk)
+
+
+@compiled
+def _aging(plant, laws, x):
+    """Return how fast, at a place x, the drive grows (less the ripple's part), and R and N."""
+    drive = _excitation(laws)[1]
+    if laws.ripple != 0.0:
+        drive = drive - _ripple(laws)[3]
+    factor_rate = _stiffness(laws)[1]
+    restoring, normal = _spring(plant, x)
+    return drive, factor_rate * restoring, factor_rate * (normal - plant.g1)
+
+
+@compiled
+def _aging_jerk(plant, laws, mode, x, v_rel, jerk):
+    if laws is None:
+        return jerk
+    drive, restoring, normal = _aging(plant, laws, x)
+    return jerk + drive - restoring - _friction_coefficient(plant, laws, mode, v_rel) * normal
+
+
+@compiled
+def _of_turning(laws, side, gap, slope, curvature):
+    """Turn a gap between v in the ripple's frame and zero into one between v in the room and zero."""
+    if laws is None:
+        return gap, slope, curvature
+    if laws.ripple == 0.0:
+        return gap, slope, curvature
+    _, speed, acceleration, jerk = _ripple(laws)
+    return gap + side * speed, slope + side * acceleration, curvature + side * jerk
 
 
 @in_lanes
@@ -400,15 +742,21 @@ def _gap_there(plant, mode, x_t, v_t, v_belt, a_belt, u, t, side, level, rate, d
 
 
 @compiled
-def _gap_at(plant, mode, x, v, v_belt, a_belt, u, t, side, level, rate):
+def _gap_at(plant, mode, x, v, v_belt, a_belt, u, t, side, level, rate, turning):
     """Slip for a time t; return the gap side (v - level - rate t), its slope and curvature, x, v, a, the contact force
-    and the integrals of v^2 and of that force's power."""
+    and the integrals of v^2 and of that force's power. With ``turning`` the gap is to rest in the room."""
     x_t, v_t, _, _, _, dv2, dfv = slip_step(plant, mode, x, v, v_belt, a_belt * t, u, t)
-    return _gap_there(plant, mode, x_t, v_t, v_belt, a_belt, u, t, side, level, rate, dv2, dfv)
+    then = later(plant, t)
+    gap, slope, curvature, x_t, v_t, a_t, f_t, dv2, dfv = _gap_there(
+        then, mode, x_t, v_t, v_belt, a_belt, u, t, side, level, rate, dv2, dfv
+    )
+    if turning:
+        gap, slope, curvature = _of_turning(then.laws, side, gap, slope, curvature)
+    return gap, slope, curvature, x_t, v_t, a_t, f_t, dv2, dfv
 
 
 @compiled
-def _dip(plant, mode, x, v, v_belt, a_belt, u, h, side, level, rate, slope, slope_end):
+def _dip(plant, mode, x, v, v_belt, a_belt, u, h, side, level, rate, slope, slope_end, turning):
     """Look for a time in (0, h) at which a gap that falls at 0 and rises at h is below zero: Newton on its slope.
 
     Return whether there is one, and the time.
@@ -417,7 +765,9 @@ def _dip(plant, mode, x, v, v_belt, a_belt, u, h, side, level, rate, slope, slop
     high = h
     t = h * slope / (slope - slope_end)
     for _ in range(60):
-        gap, slope, curvature, _, _, _, _, _, _ = _gap_at(plant, mode, x, v, v_belt, a_belt, u, t, side, level, rate)
+        gap, slope, curvature, _, _, _, _, _, _ = _gap_at(
+            plant, mode, x, v, v_belt, a_belt, u, t, side, level, rate, turning
+        )
         if gap < -V_REL_ZERO:
             return True, t
         if slope < 0.0:
@@ -478,14 +828,15 @@ def _last_stretch(gap, slope, curvature, h):
 def _stretch(plant, side, x, v, a, contact, curvature, dt, int_v2, int_fv):
     """Return x, the integral of v^2 and that of the contact force's power after a Taylor step of length dt in slip."""
     contact_slope = side * curvature + 2.0 * plant.beta * a + spring_slopes(plant, x)[0] * v
-    int_v2 = int_v2 + dt * (v * (v + a * dt))
-    int_fv = int_fv + dt * (contact * v + 0.5 * dt * (contact * a + contact_slope * v))
+    w = room_v(plant, v)
+    int_v2 = int_v2 + dt * (w * (w + a * dt))
+    int_fv = int_fv + dt * (contact * w + 0.5 * dt * (contact * a + contact_slope * w))
     return x + dt * (v + 0.5 * a * dt), int_v2, int_fv
 
 
 @compiled
-def _closing(plant, mode, x, v, v_belt, a_belt, u, h, t, side, level, rate, looked, look):
-    """Find where in (0, h] the gap side (v - level - rate t) falls through zero: Newton in a bracket, from a guess t.
+def _closing(plant, mode, x, v, v_belt, a_belt, u, h, t, side, level, rate, turning, looked, look):
+    """Find where in (0, h] the gap of :func:`_gap_at` falls through zero: Newton in a bracket, from a guess t.
 
     If ``looked`` is true, ``look`` is what :func:`_gap_at` gives there.
 
@@ -496,7 +847,7 @@ def _closing(plant, mode, x, v, v_belt, a_belt, u, h, t, side, level, rate, look
     high = h
     for _ in range(80):
         if not looked:
-            look = _gap_at(plant, mode, x, v, v_belt, a_belt, u, t, side, level, rate)
+            look = _gap_at(plant, mode, x, v, v_belt, a_belt, u, t, side, level, rate, turning)
         looked = False
         gap, slope, curvature, x_t, v_t, a_t, f_t, dv2, dfv = look
         if gap > 0.0:
@@ -512,7 +863,7 @@ def _closing(plant, mode, x, v, v_belt, a_belt, u, h, t, side, level, rate, look
         if near or high - low < TIME_ZERO:
             break
         t = t + dt
-    x_t, dv2, dfv = _stretch(plant, side, x_t, v_t, a_t, f_t, curvature, dt, dv2, dfv)
+    x_t, dv2, dfv = _stretch(later(plant, t), side, x_t, v_t, a_t, f_t, curvature, dt, dv2, dfv)
     return t + dt, x_t, a_t, dv2, dfv
 
 
@@ -525,7 +876,8 @@ def _contact_loss_time(plant, mode, x, v, v_belt, a_belt, u, high):
             break
         t = 0.5 * (low + high)
         x_t, _, _, _, _, _, _ = slip_step(plant, mode, x, v, v_belt, a_belt * t, u, t)
-        if spring(plant, x_t)[1] > 0.0:
+        then = later(plant, t)
+        if spring(then, room_x(then, x_t))[1] > 0.0:
             low = t
         else:
             high = t
@@ -533,9 +885,103 @@ def _contact_loss_time(plant, mode, x, v, v_belt, a_belt, u, high):
 
 
 @compiled
+def _switching(plant, laws, mode, x, v, v_belt, a_belt, u, x_end, v_end, h):
+    """Look for the first time in a step of length h at which x falls through zero, where the field is frozen to one
+    side of it: whether there is one, the time, v, and the integrals of v^2 and of the contact force's power."""
+    if laws is None:
+        return False, h, v_end, 0.0, 0.0
+    side = laws.side
+    if plant.geometry != DISCONTINUOUS:
+        return False, h, v_end, 0.0, 0.0
+    end = later(plant, h)
+    gap = side * room_x(plant, x)
+    gap_end = side * room_x(end, x_end)
+    rises = side * room_v(plant, v) > 0.0
+    leaves = gap_end < -SIDE_ZERO or (gap > SIDE_ZERO and gap_end <= 0.0)
+    low = 0.0
+    high = h
+    turned = side * room_v(end, v_end) > 0.0
+    if (rises and not turned and leaves and gap <= SIDE_ZERO) or (not rises and turned and not leaves):
+        # From zero up and back, or down and up again: it turns in between, at the gap's extreme.
+        first = 0.0
+        last = h
+        for _ in range(60):
+            middle = 0.5 * (first + last)
+            _, v_t, _, _, _, _, _ = slip_step(plant, mode, x, v, v_belt, a_belt * middle, u, middle)
+            if (side * room_v(later(plant, middle), v_t) > 0.0) == rises:
+                first = middle
+            else:
+                last = middle
+        if rises:
+            low = last
+        else:
+            high = last
+            x_t, _, _, _, _, _, _ = slip_step(plant, mode, x, v, v_belt, a_belt * high, u, high)
+            leaves = side * room_x(later(plant, high), x_t) < -SIDE_ZERO
+    if not leaves:
+        return False, h, v_end, 0.0, 0.0
+    t = 0.5 * (low + high)
+    v_t = v_end
+    dv2 = 0.0
+    dfv = 0.0
+    for _ in range(100):
+        x_t, v_t, _, _, _, dv2, dfv = slip_step(plant, mode, x, v, v_belt, a_belt * t, u, t)
+        then = later(plant, t)
+        gap = side * room_x(then, x_t)
+        slope = side * room_v(then, v_t)
+        if gap > 0.0:
+            low = t
+        else:
+            high = t
+        if abs(gap) <= 0.1 * SIDE_ZERO or high - low < 0.01 * TIME_ZERO:
+            break
+        following = t - gap / slope if slope < 0.0 else 0.5 * (low + high)
+        if not low < following < high:
+            following = 0.5 * (low + high)
+        t = following
+    return True, t, v_t, dv2, dfv
+
+
+@compiled
+def _faced_in_slip(plant, laws, mode, x, v, v_belt, u):
+    """Return the plant frozen to its side of x = 0; a mass at rest on it goes where the other forces push."""
+    if laws is None:
+        return plant
+    plant = faced(plant, x, v)
+    if plant.geometry == DISCONTINUOUS and plant.laws.side == 0.0:
+        a, _ = slip_forces(plant, mode, x, v, v_belt, u)
+        plant = _with_laws(plant, plant.laws, 1.0 if a >= 0.0 else -1.0, plant.laws.time)
+    return plant
+
+
+@compiled
+def _rounding(plant, laws, mode, x, v, v_belt):
+    """Return an error per unit of time below which rounding hides the estimate: of large forces in balance."""
+    if laws is None:
+        return 0.0
+    place = room_x(plant, x)
+    restoring, normal = spring(plant, place)
+    forces = abs(restoring) + abs(friction_coefficient(plant, mode, v - v_belt) * normal)
+    places = (abs(x) + abs(place)) * abs(spring_slopes(plant, place)[0])
+    drives = laws.force * (laws.force_rate * laws.time + abs(laws.force_phase))
+    shake = laws.ripple * laws.ripple_rate
+    drives += shake * (laws.ripple_rate * laws.time + abs(laws.ripple_phase))
+    return ROUNDING * (forces + 0.1 * (places + drives))
+
+
+@compiled
+def _at_zero(laws, x):
+    """Return x = 0, in the ripple's frame."""
+    if laws is None:
+        return x
+    return -_ripple(laws)[0] if laws.ripple != 0.0 else 0.0
+
+
+@compiled
 def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_turning, known):
     """Slip for ``duration``, or until v_rel returns to zero (LANDING), contact is lost (CONTACT_LOSS), v changes
-    sign (TURNING, if asked for) or the error rule cannot be met (STUCK_STEP).
+    sign (TURNING, if asked for), x does where that switches the field (SWITCHING) or the error rule cannot be met
+    (STUCK_STEP).
 
     ``known`` are 18 numbers: whether the first step was tried already (0: no, 1: over ``duration``, 2: and the time at
     which it lands, or else turns, was guessed and looked at), what :func:`slip_step` gave, the time, and what
@@ -543,10 +989,11 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
     Return the time spent, x, v, the event, the integrals of v^2 and of the contact force's power, and the least and
     greatest x met. After LANDING v equals the belt speed exactly, after TURNING it is exactly zero.
     """
+    plant = _faced_in_slip(plant, plant.laws, mode, x, v, v_belt, u)
     t = 0.0
     h = min(duration, MAX_SLIP_STEP)
-    x_min = x
-    x_max = x
+    x_min = room_x(plant, x)
+    x_max = x_min
     int_v2 = 0.0
     int_fv = 0.0
     event = NO_EVENT
@@ -555,15 +1002,17 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
         remaining = duration - t
         h = min(h, remaining)
         belt = v_belt + a_belt * t
+        now = later(plant, t)
         looked = first and known[0] == 2.0
         if first and known[0] > 0.0:
             trial = known[1:8]
         else:
-            trial = slip_step(plant, mode, x, v, belt, a_belt * h, u, h)
+            trial = slip_step(now, mode, x, v, belt, a_belt * h, u, h)
         first = False
         x_end, v_end, a, a_end, error, dv2, dfv = trial
         allowed = TOLERANCE * h * max(1.0, abs(x), abs(v), STIFF * abs(a))
-        if not error <= allowed:  # "not" lets a NaN shrink the step too
+        noise = h * _rounding(now, now.laws, mode, x, v, belt)
+        if not error <= max(allowed, noise):  # "not" lets a NaN shrink the step too
             h = 0.5 * h
             if h < MIN_SLIP_STEP:
                 event = STUCK_STEP
@@ -584,57 +1033,100 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
             if not looked:
                 guess = _closing_guess(gap, slope, gap_end, slope_end, h)
         elif _dips(gap, slope, gap_end, slope_end, h):
-            lands, length = _dip(plant, mode, x, v, belt, a_belt, u, h, mode, belt, a_belt, slope, slope_end)
+            lands, length = _dip(now, mode, x, v, belt, a_belt, u, h, mode, belt, a_belt, slope, slope_end, False)
             guess = 0.5 * length
             length = length if lands else h
         if lands:
             length, x_end, a_end, dv2, dfv = _closing(
-                plant, mode, x, v, belt, a_belt, u, length, guess, mode, belt, a_belt, looked, known[9:]
+                now, mode, x, v, belt, a_belt, u, length, guess, mode, belt, a_belt, False, looked, known[9:]
             )
             v_end = belt + a_belt * length
             event = LANDING
 
+        switches, t_switch, v_switch, dv2_switch, dfv_switch = _switching(
+            now, now.laws, mode, x, v, belt, a_belt, u, x_end, v_end, length
+        )
+        if switches:
+            length, v_end, dv2, dfv = t_switch, v_switch, dv2_switch, dfv_switch
+            x_end = _at_zero(later(now, length).laws, x_end)
+            a_end, _ = slip_forces(later(now, length), mode, x_end, v_end, belt + a_belt * length, u)
+            event = SWITCHING
+
         turns = False
         bracket = length
-        side = 1 if v > 0.0 else -1
-        if v * v_end < 0.0:
+        end = later(now, length)
+        w = room_v(now, v)
+        w_end = room_v(end, v_end)
+        b = _room_a(now.laws, a)
+        b_end = _room_a(end.laws, a_end)
+        side = 1 if w > 0.0 else -1
+        if w * w_end < 0.0:
             turns = True
             if lands or not looked:
-                guess = _closing_guess(side * v, side * a, side * v_end, side * a_end, length)
-        elif v != 0.0 and _dips(side * v, side * a, side * v_end, side * a_end, length):
-            turns, bracket = _dip(plant, mode, x, v, belt, a_belt, u, length, side, 0.0, 0.0, side * a, side * a_end)
+                guess = _closing_guess(side * w, side * b, side * w_end, side * b_end, length)
+        elif w != 0.0 and _dips(side * w, side * b, side * w_end, side * b_end, length):
+            turns, bracket = _dip(
+                now, mode, x, v, belt, a_belt, u, length, side, 0.0, 0.0, side * b, side * b_end, True
+            )
             guess = 0.5 * bracket
         if turns:
             t_turn, x_turn, _, dv2_turn, dfv_turn = _closing(
-                plant, mode, x, v, belt, a_belt, u, bracket, guess, side, 0.0, 0.0, looked and not lands, known[9:]
+                now, mode, x, v, belt, a_belt, u, bracket, guess, side, 0.0, 0.0, True, looked and not lands, known[9:]
             )
-            x_min = min(x_min, x_turn)
-            x_max = max(x_max, x_turn)
-            if stop_at_turning or spring(plant, x_turn)[1] <= 0.0:
-                length, x_end, v_end, dv2, dfv = t_turn, x_turn, 0.0, dv2_turn, dfv_turn
+            then = later(now, t_turn)
+            place = room_x(then, x_turn)
+            x_min = min(x_min, place)
+            x_max = max(x_max, place)
+            if stop_at_turning or spring(then, place)[1] <= 0.0:
+                length, x_end, v_end, dv2, dfv = t_turn, x_turn, _frame_v(then.laws, 0.0), dv2_turn, dfv_turn
                 event = TURNING
 
         # N falls with |x|: it is least at a turning point or at the end of the step.
-        if spring(plant, x_end)[1] <= 0.0:
-            length = _contact_loss_time(plant, mode, x, v, belt, a_belt, u, length)
-            x_end, v_end, a, a_end, error, dv2, dfv = slip_step(plant, mode, x, v, belt, a_belt * length, u, length)
+        end = later(now, length)
+        if spring(end, room_x(end, x_end))[1] <= 0.0:
+            length = _contact_loss_time(now, mode, x, v, belt, a_belt, u, length)
+            x_end, v_end, a, a_end, error, dv2, dfv = slip_step(now, mode, x, v, belt, a_belt * length, u, length)
             event = CONTACT_LOSS
 
         t = duration if event == NO_EVENT and h == remaining else t + length
         x = x_end
         v = v_end
-        x_min = min(x_min, x)
-        x_max = max(x_max, x)
+        place = room_x(later(plant, t), x)
+        x_min = min(x_min, place)
+        x_max = max(x_max, place)
         int_v2 += dv2
         int_fv += dfv
         if event != NO_EVENT:
             break
-        if error < STEP_DOUBLING * allowed:
+        if error < max(STEP_DOUBLING * allowed, noise):
             h = min(2.0 * h, MAX_SLIP_STEP)
     if event == NO_EVENT:
         belt = v_belt + a_belt * duration
         if mode * (v - belt) <= V_REL_ZERO:
             v = belt
+    return t, x, v, event, int_v2, int_fv, x_min, x_max
+
+
+@compiled
+def slip_across(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_turning):
+    """:func:`slip_until_event` that goes on where only the field switches."""
+    t = 0.0
+    int_v2 = 0.0
+    int_fv = 0.0
+    x_min = room_x(plant, x)
+    x_max = x_min
+    event = SWITCHING
+    for _ in range(MAX_EVENTS):
+        dt, x, v, event, dv2, dfv, low, high = slip_until_event(
+            later(plant, t), mode, x, v, v_belt + a_belt * t, a_belt, u, duration - t, stop_at_turning, NOTHING_KNOWN
+        )
+        t += dt
+        int_v2 += dv2
+        int_fv += dfv
+        x_min = min(x_min, low)
+        x_max = max(x_max, high)
+        if event != SWITCHING:
+            break
     return t, x, v, event, int_v2, int_fv, x_min, x_max
 
 
@@ -646,10 +1138,22 @@ def _cone_excess(plant, side, x, v_belt, a_belt, u, t):
     """Return by how much a mass stuck since t = 0 at x exceeds one side of the stick cone at time t, and the slope."""
     speed = v_belt + a_belt * t
     x_t = x + (v_belt + 0.5 * a_belt * t) * t
-    load, limit = stick_load(plant, x_t, speed, a_belt, u)
-    restoring_slope, normal_slope = spring_slopes(plant, x_t)
-    load_slope = 2.0 * plant.beta * a_belt + restoring_slope * speed
-    return side * load - limit, side * load_slope - plant.mu_s * normal_slope * speed
+    then = later(plant, t)
+    load, limit = stick_load(then, x_t, speed, a_belt, u)
+    place = room_x(then, x_t)
+    restoring_slope, normal_slope = spring_slopes(then, place)
+    w = room_v(then, speed)
+    load_slope = 2.0 * plant.beta * _room_a(then.laws, a_belt) + restoring_slope * w
+    slope = side * load_slope - plant.mu_s * normal_slope * w
+    return side * load - limit, _aging_excess(then, then.laws, side, place, slope)
+
+
+@compiled
+def _aging_excess(plant, laws, side, x, slope):
+    if laws is None:
+        return slope
+    drive, restoring, normal = _aging(plant, laws, x)
+    return slope + side * (restoring - drive) - plant.mu_s * normal
 
 
 @compiled
@@ -681,22 +1185,26 @@ def _breakaway_time(plant, side, x, v_belt, a_belt, u, low, high):
 
 @compiled
 def stick_until_event(plant, x, v_belt, a_belt, u, duration):
-    """Ride with the belt for ``duration``, or until breakaway; return the time spent and the event.
+    """Ride with the belt for ``duration``, until breakaway, or until x is where that switches the field (SWITCHING);
+    return the time spent and the event.
 
-    The cone is walked in pieces no longer than an eighth of the spring's length scale, each side of it on its own; a
-    side that rises and falls again within a piece is followed to its top. The time returned lies just outside the
-    cone.
+    The cone is walked in pieces no longer than an eighth of the spring's length scale and of a radian of excitation,
+    each side of it on its own; a side that rises and falls again within a piece is followed to its top. The time
+    returned lies just outside the cone.
     """
-    scale = 1.0 if plant.geometry == LINEAR else min(1.0, plant.alpha)
+    scale = min(1.0, plant.alpha) if plant.geometry == EXACT or plant.geometry == CUBIC else 1.0
     fastest = max(abs(v_belt), abs(v_belt + a_belt * duration))
+    plant = faced(plant, x, v_belt)
     piece = duration
     if fastest > 0.0:
         piece = min(duration, 0.125 * scale / fastest)
+    piece = _short_of_excitation(plant.laws, piece)
     t = 0.0
     while t < duration:
         t_end = t + piece
         if t_end >= duration or t_end <= t:
             t_end = duration
+        switches, t_end = _switches_in_stick(plant, plant.laws, x, v_belt, a_belt, t, t_end)
         first = t_end
         found = False
         for side in (-1, 1):
@@ -719,8 +1227,60 @@ def stick_until_event(plant, x, v_belt, a_belt, u, duration):
                 found = True
         if found:
             return first, BREAKAWAY
+        if switches:
+            return t_end, SWITCHING
         t = t_end
     return duration, NO_EVENT
+
+
+@compiled
+def _short_of_excitation(laws, piece):
+    if laws is None:
+        return piece
+    fastest = 0.0
+    if laws.force != 0.0:
+        fastest = max(fastest, laws.force_rate)
+    if laws.ripple != 0.0:
+        fastest = max(fastest, laws.ripple_rate)
+    if laws.depth != 0.0:
+        fastest = max(fastest, laws.depth_rate)
+    return min(piece, 0.125 / fastest) if fastest > 0.0 else piece
+
+
+@compiled
+def _switches_in_stick(plant, laws, x, v_belt, a_belt, t, t_end):
+    """Whether a stuck mass passes x = 0 in (t, t_end] where that switches the field, and the time if so, else t_end."""
+    if laws is None:
+        return False, t_end
+    if plant.geometry != DISCONTINUOUS:
+        return False, t_end
+    side = laws.side
+    low = t
+    high = t_end
+    if side * room_x(later(plant, high), x + (v_belt + 0.5 * a_belt * high) * high) > -SIDE_ZERO:
+        return False, t_end
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        if middle <= low or middle >= high:
+            break
+        if side * room_x(later(plant, middle), x + (v_belt + 0.5 * a_belt * middle) * middle) > 0.0:
+            low = middle
+        else:
+            high = middle
+    return True, high
+
+
+@compiled
+def ride_across(plant, x, v_belt, duration):
+    """:func:`stick_until_event` with a steady belt and no force, which goes on where only the field switches and stick
+    holds. Return the time spent and the event."""
+    t, event = stick_until_event(plant, x, v_belt, 0.0, 0.0, duration)
+    if event == SWITCHING:
+        if mode_at_zero_v_rel(plant, 0.0, v_belt, 0.0, 0.0) != STICK:
+            return t, BREAKAWAY
+        dt, event = stick_until_event(plant, 0.0, v_belt, 0.0, 0.0, duration - t)
+        t += dt
+    return t, event
 
 
 @in_lanes
@@ -745,13 +1305,70 @@ def _stick_leg(plant, x, v_belt, a_belt, u, duration):
     dt, event = stick_until_event(plant, x, v_belt, a_belt, u, duration)
     dx, int_v2, int_fv = _ride(plant, x, v_belt, a_belt, u, dt)
     x_end = x + dx
+    if event == SWITCHING:
+        x_end = _at_zero(later(plant, dt).laws, x_end)
     x_min = min(x, x_end)
     x_max = max(x, x_end)
     if v_belt * (v_belt + a_belt * dt) < 0.0:  # the belt reverses
         x_turn = x - 0.5 * v_belt * v_belt / a_belt
         x_min = min(x_min, x_turn)
         x_max = max(x_max, x_turn)
+    int_v2, int_fv, x_min, x_max = _excited_ride(
+        plant, plant.laws, x, v_belt, a_belt, u, dt, int_v2, int_fv, x_min, x_max
+    )
     return dt, event, x_end, int_v2, int_fv, x_min, x_max
+
+
+# Gauss and Legendre's five nodes and weights on [0, 1]
+_NODES = (0.04691007703066802, 0.23076534494715845, 0.5, 0.7692346550528415, 0.9530899229693319)
+_WEIGHTS = (0.11846344252809454, 0.23931433524968324, 0.28444444444444444, 0.23931433524968324, 0.11846344252809454)
+
+
+@compiled
+def _excited_ride(plant, laws, x, v_belt, a_belt, u, duration, int_v2, int_fv, x_min, x_max):
+    """Return what :func:`_stick_leg` does of a ride under excitation: the integrals by quadrature, the extremes of x
+    where v changes sign between two nodes or at an end."""
+    if laws is None:
+        return int_v2, int_fv, x_min, x_max
+    if laws.force == 0.0 and laws.ripple == 0.0 and laws.depth == 0.0:
+        return int_v2, int_fv, x_min, x_max
+    pieces = int(duration / _short_of_excitation(laws, 0.5)) + 1
+    length = duration / pieces
+    int_v2 = 0.0
+    int_fv = 0.0
+    x_min = room_x(plant, x)
+    x_max = x_min
+    then = later(plant, duration)
+    place = room_x(then, x + (v_belt + 0.5 * a_belt * duration) * duration)
+    x_min = min(x_min, place)
+    x_max = max(x_max, place)
+    faced_plant = faced(plant, x, v_belt)
+    before = 0.0
+    w_before = room_v(plant, v_belt)
+    for piece in range(pieces):
+        for j in range(5):
+            t = (piece + _NODES[j]) * length
+            then = later(faced_plant, t)
+            speed = v_belt + a_belt * t
+            w = room_v(then, speed)
+            load, _ = stick_load(then, x + (v_belt + 0.5 * a_belt * t) * t, speed, a_belt, u)
+            int_v2 += _WEIGHTS[j] * length * (w * w)
+            int_fv += _WEIGHTS[j] * length * (load * w)
+            if w * w_before < 0.0:
+                low = before
+                high = t
+                for _ in range(60):
+                    middle = 0.5 * (low + high)
+                    if room_v(later(plant, middle), v_belt + a_belt * middle) * w_before > 0.0:
+                        low = middle
+                    else:
+                        high = middle
+                place = room_x(later(plant, high), x + (v_belt + 0.5 * a_belt * high) * high)
+                x_min = min(x_min, place)
+                x_max = max(x_max, place)
+            before = t
+            w_before = w
+    return int_v2, int_fv, x_min, x_max
 
 
 @compiled
@@ -788,17 +1405,21 @@ def _advance(plant, x, v, v_belt, a_belt, u, duration, events, known):
     x_max = x
     belt = v_belt
     status = OK
-    mode = mode_of(plant, x, v, v_belt, a_belt, u)
-    if spring(plant, x)[1] <= 0.0:
-        return x, v, v_belt, mode, CONTACT_LOST, 0.0, 0, 0.0, 0.0, 0.0, x, x
+    x_room = x
+    v_room = v
+    x, v = _into_frame(plant.laws, x, v, v_belt)
+    mode = _mode_of(plant, x, v, v_belt, a_belt, u)
+    if spring(plant, x_room)[1] <= 0.0:
+        return x_room, v_room, v_belt, mode, CONTACT_LOST, 0.0, 0, 0.0, 0.0, 0.0, x_room, x_room
     while t < duration:
         remaining = duration - t
+        now = later(plant, t)
         if mode == STICK:
-            dt, event, x, dv2, dfv, low, high = _stick_leg(plant, x, belt, a_belt, u, remaining)
+            dt, event, x, dv2, dfv, low, high = _stick_leg(now, x, belt, a_belt, u, remaining)
             stick_time += dt
         else:
             dt, x, v, event, dv2, dfv, low, high = slip_until_event(
-                plant, mode, x, v, belt, a_belt, u, remaining, False, known
+                now, mode, x, v, belt, a_belt, u, remaining, False, known
             )
             known = NOTHING_KNOWN
         int_v2 += dv2
@@ -807,25 +1428,28 @@ def _advance(plant, x, v, v_belt, a_belt, u, duration, events, known):
         x_max = max(x_max, high)
         t = duration if event == NO_EVENT else t + dt
         belt = v_belt + a_belt * t
+        then = later(plant, t)
         kind = event
         if mode == STICK:
             v = belt
             if event == BREAKAWAY:
-                mode = _breakaway_mode(plant, x, belt, a_belt, u)
+                mode = _breakaway_mode(then, x, belt, a_belt, u)
+            elif event == SWITCHING:
+                mode = mode_at_zero_v_rel(then, x, belt, a_belt, u)
         elif event == LANDING:
             v = belt
-            landed = mode_at_zero_v_rel(plant, x, belt, a_belt, u)
+            landed = mode_at_zero_v_rel(then, x, belt, a_belt, u)
             kind = RESTICK if landed == STICK else (GRAZING if landed == mode else CROSSING)
             mode = landed
         elif event == NO_EVENT and v == belt:
-            mode = mode_at_zero_v_rel(plant, x, belt, a_belt, u)
+            mode = mode_at_zero_v_rel(then, x, belt, a_belt, u)
         if event != NO_EVENT:
             if events is not None:
                 if n_events < len(events):
                     events[n_events, 0] = t
                     events[n_events, 1] = kind
-                    events[n_events, 2] = x
-                    events[n_events, 3] = v
+                    events[n_events, 2] = room_x(then, x)
+                    events[n_events, 3] = room_v(then, v)
             n_events += 1
             if event == CONTACT_LOSS:
                 status = CONTACT_LOST
@@ -836,6 +1460,9 @@ def _advance(plant, x, v, v_belt, a_belt, u, duration, events, known):
             if n_events >= MAX_EVENTS:
                 status = EVENT_LIMIT
                 break
+    end = later(plant, t)
+    x = room_x(end, x)
+    v = room_v(end, v)
     return x, v, belt, mode, status, t, n_events, int_v2, stick_time, int_fv, x_min, x_max
 
 
@@ -856,7 +1483,7 @@ def trace(plant, x, v, v_belt, a_belt, u, times, samples, events):
     t = 0.0
     while taken < len(times) and status == OK and len(events) - n_events >= MAX_EVENTS:
         x, v, belt, mode, status, dt, n, dv2, dstick, dfv, _, _ = advance(
-            plant, x, v, v_belt + a_belt * t, a_belt, u, times[taken] - t, events[n_events:]
+            later(plant, t), x, v, v_belt + a_belt * t, a_belt, u, times[taken] - t, events[n_events:]
         )
         for i in range(n_events, n_events + n):
             events[i, 0] += t
@@ -871,6 +1498,44 @@ def trace(plant, x, v, v_belt, a_belt, u, times, samples, events):
         samples[taken, 3] = mode
         taken += 1
     return taken, n_events, status, t, int_v2, stick_time, int_fv
+
+
+@compiled
+def energy_in_spring(plant, x):
+    """Return V(x) at the plant's time: that of a modulated spring is as many times as great as its force."""
+    return _modulated_pair(plant.laws, potential(plant, x), 0.0)[0]
+
+
+@compiled
+def _excitation_power(plant, laws, x, w):
+    if laws is None:
+        return 0.0
+    return _excitation(laws)[0] * w + _stiffness(laws)[1] * potential(plant, x)
+
+
+@compiled
+def excitation_work(plant, x, v, v_belt, a_belt, u, duration, events):
+    """Return the work of the excitation over a motion that :func:`trace` has followed for ``duration``: of the exciting
+    force, and of what modulates the stiffness. ``events`` (m, 4) are its events: between them quadrature is exact to
+    integration errors."""
+    work = 0.0
+    t = 0.0
+    for n in range(len(events) + 1):
+        end = events[n, 0] if n < len(events) else duration
+        pieces = int((end - t) / 0.05) + 1
+        length = (end - t) / pieces
+        for _ in range(pieces if length > 0.0 else 0):
+            # Each node is reached from the piece's beginning, so that no error adds up.
+            for j in range(5):
+                out = advance(later(plant, t), x, v, v_belt + a_belt * t, a_belt, u, _NODES[j] * length, None)
+                then = later(plant, t + _NODES[j] * length)
+                work += _WEIGHTS[j] * length * _excitation_power(then, then.laws, out[0], out[1])
+            out = advance(later(plant, t), x, v, v_belt + a_belt * t, a_belt, u, length, None)
+            x = out[0]
+            v = out[1]
+            t = t + length
+        t = end
+    return work
 
 
 # Passive orbits: pieces of the analysis that run many times ---------------------------------------------------------
@@ -903,7 +1568,7 @@ def settle(plant, v_belt, x, v, turnings, exits):
         return ORBIT_LOST_CONTACT, x, math.nan, math.nan
     for _ in range(100 * turnings):
         if mode == STICK:
-            dt, event = stick_until_event(plant, x, v_belt, 0.0, 0.0, STICK_PATIENCE)
+            dt, event = ride_across(plant, x, v_belt, STICK_PATIENCE)
             if event == NO_EVENT:
                 return AT_REST, x, math.nan, math.nan
             x = x + v_belt * dt
@@ -915,14 +1580,11 @@ def settle(plant, v_belt, x, v, turnings, exits):
             exits[n_exits] = x
             n_exits += 1
             v = v_belt
-            load, _ = stick_load(plant, x, v_belt, 0.0, 0.0)
-            mode = SLIP_BACKWARD if load > 0.0 else SLIP_FORWARD
+            mode = _breakaway_mode(plant, x, v_belt, 0.0, 0.0)
             maxima = 0
             last_max = math.nan
             continue
-        _, x, v, event, _, _, _, _ = slip_until_event(
-            plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
-        )
+        _, x, v, event, _, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
         if event == LANDING:
             mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
         elif event == TURNING:
@@ -953,8 +1615,7 @@ def stick_slip_lap(plant, v_belt, x_exit):
     """
     x = x_exit
     v = v_belt
-    load, _ = stick_load(plant, x, v_belt, 0.0, 0.0)
-    mode = SLIP_BACKWARD if load > 0.0 else SLIP_FORWARD
+    mode = _breakaway_mode(plant, x, v_belt, 0.0, 0.0)
     t = 0.0
     stick_time = 0.0
     x_min = x
@@ -965,7 +1626,7 @@ def stick_slip_lap(plant, v_belt, x_exit):
     int_v2 = 0.0
     for _ in range(MAX_EVENTS):
         if mode == STICK:
-            dt, event = stick_until_event(plant, x, v_belt, 0.0, 0.0, STICK_PATIENCE)
+            dt, event = ride_across(plant, x, v_belt, STICK_PATIENCE)
             t += dt
             stick_time += dt
             int_v2 += v_belt * v_belt * dt
@@ -974,15 +1635,12 @@ def stick_slip_lap(plant, v_belt, x_exit):
             sticks += 1
             if abs(x - x_exit) < SAME_PLACE:
                 return REPEATED_BREAKAWAY, t, stick_time, x_min, x_max, x_restick, sticks, forward_arcs, int_v2
-            load, _ = stick_load(plant, x, v_belt, 0.0, 0.0)
-            mode = SLIP_BACKWARD if load > 0.0 else SLIP_FORWARD
+            mode = _breakaway_mode(plant, x, v_belt, 0.0, 0.0)
             if mode == SLIP_FORWARD:
                 forward_arcs += 1
             v = v_belt
             continue
-        dt, x, v, event, dv2, _, low, high = slip_until_event(
-            plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, False, NOTHING_KNOWN
-        )
+        dt, x, v, event, dv2, _, low, high = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, False)
         t += dt
         int_v2 += dv2
         x_min = min(x_min, low)
@@ -1015,9 +1673,7 @@ def next_maximum(plant, v_belt, x):
     x_low = math.nan
     forward_arcs = 0
     for _ in range(MAX_EVENTS):
-        dt, x, v, event, dv2, _, _, _ = slip_until_event(
-            plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
-        )
+        dt, x, v, event, dv2, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
         t += dt
         int_v2 += dv2
         if event == LANDING:
@@ -1037,13 +1693,10 @@ def next_maximum(plant, v_belt, x):
 def slip_returns_to_stick(plant, v_belt, x):
     """Whether a mass that breaks away at x sticks again before it has slipped through one more full lap."""
     v = v_belt
-    load, _ = stick_load(plant, x, v_belt, 0.0, 0.0)
-    mode = SLIP_BACKWARD if load > 0.0 else SLIP_FORWARD
+    mode = _breakaway_mode(plant, x, v_belt, 0.0, 0.0)
     maxima = 0
     for _ in range(MAX_EVENTS):
-        _, x, v, event, _, _, _, _ = slip_until_event(
-            plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
-        )
+        _, x, v, event, _, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
         if event == LANDING:
             mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
             if mode == STICK:
@@ -1077,7 +1730,7 @@ def classify(plant, v_belt, xs, vs, exits, exit_labels, centres, bounds, bound_l
             continue
         for _ in range(2000):
             if mode == STICK:
-                dt, event = stick_until_event(plant, x, v_belt, 0.0, 0.0, STICK_PATIENCE)
+                dt, event = ride_across(plant, x, v_belt, STICK_PATIENCE)
                 x = x + v_belt * dt
                 best = 1e-6
                 for i in range(len(exits)):
@@ -1085,9 +1738,7 @@ def classify(plant, v_belt, xs, vs, exits, exit_labels, centres, bounds, bound_l
                         best = abs(exits[i] - x)
                         label = exit_labels[i]
                 break
-            _, x, v, event, _, _, _, _ = slip_until_event(
-                plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True, NOTHING_KNOWN
-            )
+            _, x, v, event, _, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
             if event == LANDING:
                 mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
             elif event == TURNING:
@@ -1154,6 +1805,7 @@ def control_interval(
     mu_s,
     k1,
     k3,
+    laws,
     actuator,
     authority,
     a_limit,
@@ -1168,13 +1820,14 @@ def control_interval(
 ):
     """Apply an action in [-1, 1] for one control interval and weigh what came of it.
 
+    ``laws``: a :class:`Laws` or None.
     FORCE: u = authority * action. BELT_SPEED: the belt heads for (1 + authority * action) * belt_speed at no more than
     a_limit, evenly over the interval. The reward terms (all <= 0) are averages over the interval.
     Return x, v, v_belt, mode, status, events, u, a_belt, the three reward terms (vibration, effort, stick), the
     means over the interval of v^2, of the stick indicator, of the contact force's and the control force's power, the
     least and greatest x, and the normal force at the end.
     """
-    plant = Plant(geometry, alpha, g1, beta, mu_s, k1, k3)
+    plant = Plant(geometry, alpha, g1, beta, mu_s, k1, k3, laws)
     u, a_belt = _actuation(actuator, authority, a_limit, belt_speed, interval, v_belt, action)
     x_end, v, v_belt, mode, status, _, n_events, int_v2, stick_time, int_fv, x_min, x_max = advance(
         plant, x, v, v_belt, a_belt, u, interval, None
@@ -1200,7 +1853,7 @@ def control_interval(
         control_power,
         x_min,
         x_max,
-        spring(plant, x_end)[1],
+        spring(later(plant, interval), x_end)[1],
     )
 
 
@@ -1213,6 +1866,7 @@ def control_intervals(
     mu_s,
     k1,
     k3,
+    laws,
     actuator,
     authority,
     a_limit,
@@ -1241,6 +1895,7 @@ def control_intervals(
             mu_s,
             k1,
             k3,
+            laws,
             actuator,
             authority,
             a_limit,
@@ -1360,8 +2015,22 @@ _OPEN, _FINISHED, _LANDED = 0.0, 1.0, 2.0  # what _F_WAY says
     S_LATE_HIGH,
     S_LATE_STICK,
     S_LATE_TIME,
-) = range(21)
-STATE_ROWS = 21
+    S_FRICTION,
+    S_MU_K,
+    S_DECAY,
+    S_MU_V,
+    S_KAPPA,
+    S_FORCE,
+    S_FORCE_RATE,
+    S_FORCE_PHASE,
+    S_RIPPLE,
+    S_RIPPLE_RATE,
+    S_RIPPLE_PHASE,
+    S_DEPTH,
+    S_DEPTH_RATE,
+    S_DEPTH_PHASE,
+) = range(35)
+STATE_ROWS = 35
 # ... and whole numbers.
 I_GEOMETRY, I_STEPS, I_KEY, I_EPISODE, I_SEEN, I_OVER, I_FIRST_STEP, I_STATUS = 0, 1, 2, 3, 4, 5, 6, 7
 INTEGER_ROWS = 8
@@ -1418,8 +2087,8 @@ _REPORTED = (
 ) = range(12)
 TASK_NUMBERS = 12
 T_ACTUATOR, T_EPISODE_STEPS, T_LATE_STEPS, T_FULL_STATE, T_SEES_BELT, T_SENSOR_DELAY, T_ONE_PLANT = 0, 1, 2, 3, 4, 5, 6
-T_TRAVEL = 7
-TASK_CODES = 8
+T_TRAVEL, T_SEES_PHASES = 7, 8
+TASK_CODES = 9
 
 
 # The cache would take it for slip_step itself.
@@ -1436,6 +2105,7 @@ def _lane_plant(geometry, w, i):
         w[_MU_S * STRIDE + i],
         w[_K1 * STRIDE + i],
         w[_K3 * STRIDE + i],
+        None,
     )
 
 
@@ -1803,7 +2473,11 @@ def _wants_look(w, i, sub, n, interval, one_plant):
 @compiled
 def _lane_by_events(geometry, w, i, interval, known):
     """Advance one lane as a single environment is; ``known``: see :func:`slip_until_event`."""
-    plant = _lane_plant(geometry, w, i)
+    return _plant_by_events(_lane_plant(geometry, w, i), w, i, interval, known)
+
+
+@compiled
+def _plant_by_events(plant, w, i, interval, known):
     x, v, belt, mode, status, _, n_events, int_v2, stick_time, int_fv, x_min, x_max = _advance(
         plant,
         w[_X * STRIDE + i],
@@ -1826,7 +2500,7 @@ def _lane_by_events(geometry, w, i, interval, known):
     w[_INT_FV * STRIDE + i] = int_fv
     w[_X_MIN * STRIDE + i] = x_min
     w[_X_MAX * STRIDE + i] = x_max
-    w[_NORMAL * STRIDE + i] = spring(plant, x)[1]
+    w[_NORMAL * STRIDE + i] = spring(later(plant, interval), x)[1]
     w[_DONE_FAST * STRIDE + i] = 1.0
     return 0 if status == OK else 1
 
@@ -1910,8 +2584,96 @@ def observe(task, codes, state, integers, past, shown, observations, which):
             modulation = state[S_BELT, i] / state[S_BELT_SPEED, i]
             observations[i, place] = _observed(modulation, 1.0, task[T_BELT_AUTHORITY], limit)
             place += 1
+        if codes[T_SEES_PHASES]:
+            time = integers[I_STEPS, i] * task[T_INTERVAL]
+            for row in (S_FORCE, S_RIPPLE, S_DEPTH):
+                angle = state[row + 1, i] * time + state[row + 2, i]
+                observations[i, place] = math.cos(angle)
+                observations[i, place + 1] = math.sin(angle)
+                place += 2
         for j in range(shown.shape[1]):
             observations[i, place + j] = shown[i, j]
+
+
+@compiled
+def laws_of(state, i, time, beyond):
+    """Return the laws of environment i at a time, or None if ``beyond`` is None (else it is any :class:`Laws`: by its
+    type compiled code knows which of the two it is to be)."""
+    if beyond is None:
+        return beyond
+    return Laws(
+        0.0,
+        int(state[S_FRICTION, i]),
+        state[S_MU_K, i],
+        state[S_DECAY, i],
+        state[S_MU_V, i],
+        state[S_KAPPA, i],
+        state[S_FORCE, i],
+        state[S_FORCE_RATE, i],
+        state[S_FORCE_PHASE, i],
+        state[S_RIPPLE, i],
+        state[S_RIPPLE_RATE, i],
+        state[S_RIPPLE_PHASE, i],
+        state[S_DEPTH, i],
+        state[S_DEPTH_RATE, i],
+        state[S_DEPTH_PHASE, i],
+        time,
+    )
+
+
+@compiled
+def _plant_of(state, integers, i, time, beyond):
+    return Plant(
+        integers[I_GEOMETRY, i],
+        state[S_ALPHA, i],
+        state[S_G1, i],
+        state[S_BETA, i],
+        state[S_MU_S, i],
+        state[S_K1, i],
+        state[S_K3, i],
+        laws_of(state, i, time, beyond),
+    )
+
+
+@compiled
+def _calm(plant, laws):
+    if laws is None:
+        return plant
+    still = Laws(
+        laws.side,
+        laws.friction,
+        laws.mu_k,
+        laws.decay,
+        laws.mu_v,
+        laws.kappa,
+        0.0,
+        laws.force_rate,
+        laws.force_phase,
+        0.0,
+        laws.ripple_rate,
+        laws.ripple_phase,
+        0.0,
+        laws.depth_rate,
+        laws.depth_phase,
+        laws.time,
+    )
+    return Plant(plant.geometry, plant.alpha, plant.g1, plant.beta, plant.mu_s, plant.k1, plant.k3, still)
+
+
+@compiled
+def calm(plant):
+    """Return the plant without its excitation."""
+    return _calm(plant, plant.laws)
+
+
+@compiled
+def _shown_belt(laws, mode, v, v_belt):
+    """Return the belt's speed with its ripple, and the velocity relative to it."""
+    if laws is not None:
+        if laws.ripple != 0.0:
+            v_belt = v_belt + _ripple(laws)[1]
+            return v_belt, 0.0 if mode == STICK else v - v_belt
+    return v_belt, v - v_belt
 
 
 # One environment on its own keeps its arrays in a single one, for each that is handed over costs a call more time.
@@ -1920,7 +2682,7 @@ def observe(task, codes, state, integers, past, shown, observations, which):
 @compiled
 def arrays_in(memory):
     """Return the arrays that lie in the flat ``memory`` of one environment, as a batch of one has them: task (12,),
-    codes (8,), state (21, 1), integers (8, 1), past (delay + 1 or 0, 2, 1) and shown (1, p), in this order."""
+    codes (9,), state (35, 1), integers (8, 1), past (delay + 1 or 0, 2, 1) and shown (1, p), in this order."""
     codes = memory[TASK_NUMBERS : TASK_NUMBERS + TASK_CODES].view(np.int64)
     first = TASK_NUMBERS + TASK_CODES
     integers = memory[first : first + INTEGER_ROWS].view(np.int64).reshape((INTEGER_ROWS, 1))
@@ -1933,18 +2695,12 @@ def arrays_in(memory):
     return memory[:TASK_NUMBERS], codes, state, integers, past, shown
 
 
-@compiled
-def step_alone(memory, observations, action):
-    """Step the one environment whose arrays lie in ``memory`` (see :func:`arrays_in`), with an action in [-1, 1].
-
-    Write what it observes into ``observations`` (1, size). Return x, v, v_belt, v_rel, mode, normal force, time, force,
-    belt acceleration, least and greatest x, the means of v^2, of the stick indicator, of the contact force's and the
-    control force's power, events, status, the four reward terms, the reward, and whether the episode was terminated
-    or truncated. The law of the step is :func:`control_interval`'s, and :func:`_account` keeps the same accounts.
-    """
+@in_lanes
+def _step_alone(memory, observations, action, beyond):
     task, codes, state, integers, past, shown = arrays_in(memory)
     interval = task[T_INTERVAL]
     v_belt_before = state[S_BELT, 0]
+    laws = laws_of(state, 0, integers[I_STEPS, 0] * interval, beyond)
     (
         x,
         v,
@@ -1972,6 +2728,7 @@ def step_alone(memory, observations, action):
         state[S_MU_S, 0],
         state[S_K1, 0],
         state[S_K3, 0],
+        laws,
         codes[T_ACTUATOR],
         task[T_AUTHORITY],
         task[T_A_LIMIT],
@@ -2014,11 +2771,12 @@ def step_alone(memory, observations, action):
         else:
             truncated = True
     observe(task, codes, state, integers, past, shown, observations, (0,))
+    v_belt_shown, v_rel = _shown_belt(laws_of(state, 0, steps * interval, beyond), mode, v, v_belt)
     return (
         x,
         v,
-        v_belt,
-        v - v_belt,
+        v_belt_shown,
+        v_rel,
         mode,
         normal_force,
         steps * interval,
@@ -2040,6 +2798,25 @@ def step_alone(memory, observations, action):
         terminated,
         truncated,
     )
+
+
+@compiled
+def step_alone(memory, observations, action):
+    """Step the one environment whose arrays lie in ``memory`` (see :func:`arrays_in`), with an action in [-1, 1].
+
+    Write what it observes into ``observations`` (1, size). Return x, v, v_belt, v_rel, mode, normal force, time, force,
+    belt acceleration, least and greatest x, the means of v^2, of the stick indicator, of the contact force's and the
+    control force's power, events, status, the four reward terms, the reward, and whether the episode was terminated
+    or truncated. The law of the step is :func:`control_interval`'s, and :func:`_account` keeps the same accounts.
+    """
+    return _step_alone(memory, observations, action, None)
+
+
+@compiled
+def step_alone_beyond(memory, observations, action):
+    """Do what :func:`step_alone` does for an environment with laws beyond the paper's."""
+    beyond = Laws(0.0, STRIBECK, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    return _step_alone(memory, observations, action, beyond)
 
 
 @compiled
@@ -2269,7 +3046,7 @@ def _stepper(geometry):
     It takes
 
         work: (WORK_SIZE,), this call's own. start, end: which environments to step.
-        task (12,), codes (8,): what holds for the whole batch. state (21, n), integers (8, n): of each environment;
+        task (12,), codes (9,): what holds for the whole batch. state (35, n), integers (8, n): of each environment;
             rows as named above. past, shown: see :func:`observe`. With T_ONE_PLANT the plant and its belt speed stand
             in both halves of ``work`` already; the belt's way is only kept with T_TRAVEL.
         actions: (n,), finite; outside [-1, 1] they are clipped.
@@ -2404,6 +3181,57 @@ _step_linear = _stepper(LINEAR)
 STEPPERS = (_step_exact, _step_cubic, _step_linear)
 
 
+@compiled
+def step_beyond(
+    work,
+    start,
+    end,
+    task,
+    codes,
+    state,
+    integers,
+    past,
+    shown,
+    actions,
+    wanted,
+    observations,
+    rewards,
+    over,
+    report,
+    report_codes,
+):
+    """Do what the steppers do, for environments of any laws: one by one, as a single environment does."""
+    task, codes, work = _bare(task), _bare(codes), _bare(work)
+    state, integers, past, shown = _bare(state), _bare(integers), _bare(past), _bare(shown)
+    actions, wanted, observations, rewards = _bare(actions), _bare(wanted), _bare(observations), _bare(rewards)
+    over, report, report_codes = _bare(over), _bare(report), _bare(report_codes)
+    beyond = Laws(0.0, STRIBECK, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    interval = task[T_INTERVAL]
+    w = work[: _WORK_ROWS * STRIDE]
+    ended = 0
+    for first in range(start, end, LANES):
+        m = min(LANES, end - first)
+        _fill(w, task, codes, state, actions, first, m)
+        failures = 0
+        for i in range(m):
+            j = first + i
+            time = integers[I_STEPS, j] * interval
+            plant = _plant_of(state, integers, j, time, beyond)
+            failures += _plant_by_events(plant, w, i, interval, NOTHING_KNOWN)
+        ended += _account(
+            task, codes, state, integers, work, wanted, rewards, over, report, report_codes, first, m, failures
+        )
+        for row in range(len(wanted)):
+            if wanted[row] == O_BELT or wanted[row] == O_V_REL:
+                for i in range(m):
+                    j = first + i
+                    laws = laws_of(state, j, integers[I_STEPS, j] * interval, beyond)
+                    belt, v_rel = _shown_belt(laws, w[_MODE * STRIDE + i], state[S_V, j], state[S_BELT, j])
+                    report[row, j] = belt if wanted[row] == O_BELT else v_rel
+        observe(task, codes, state, integers, past, shown, observations, range(first, first + m))
+    return ended
+
+
 @in_threads
 def _step_exact_in_threads(works, bounds, ended, *arguments):
     for i in numba.prange(len(ended)):
@@ -2422,21 +3250,14 @@ def _step_linear_in_threads(works, bounds, ended, *arguments):
         ended[i] = _step_linear(works[i], bounds[i], bounds[i + 1], *arguments)
 
 
+@in_threads
+def step_beyond_in_threads(works, bounds, ended, *arguments):
+    for i in numba.prange(len(ended)):
+        ended[i] = step_beyond(works[i], bounds[i], bounds[i + 1], *arguments)
+
+
 # The same side by side: works (k, WORK_SIZE), bounds (k + 1,) and ended (k,) for k threads.
 STEPPERS_IN_THREADS = (_step_exact_in_threads, _step_cubic_in_threads, _step_linear_in_threads)
-
-
-@compiled
-def _plant_of(state, integers, i):
-    return Plant(
-        integers[I_GEOMETRY, i],
-        state[S_ALPHA, i],
-        state[S_G1, i],
-        state[S_BETA, i],
-        state[S_MU_S, i],
-        state[S_K1, i],
-        state[S_K3, i],
-    )
 
 
 CYCLE_POINTS = 64
@@ -2475,7 +3296,7 @@ def cycle_state(plant, points, v_belt, period, phase):
 
 
 @compiled
-def own_cycle_starts(state, integers, which, phases):
+def own_cycle_starts(state, integers, which, phases, beyond):
     """Put the environments ``which`` (k,) at ``phases`` (k,) of the cycles that a mass set down at x = 0 with the belt
     reaches, each of its own. Return (k,) flags, 1 where that is no stick-slip cycle that is found at once: those states
     are left alone."""
@@ -2484,7 +3305,7 @@ def own_cycle_starts(state, integers, which, phases):
     for j in range(len(which)):
         i = which[j]
         speed = state[S_BELT_SPEED, i]
-        plant = _plant_of(state, integers, i)
+        plant = calm(_plant_of(state, integers, i, 0.0, beyond))
         left[j] = 1
         outcome, x, _, _ = settle(plant, speed, 0.0, speed, SETTLING_LAPS, exits)
         if outcome != REPEATED_BREAKAWAY:
@@ -2512,7 +3333,7 @@ def own_cycle_starts(state, integers, which, phases):
 def blank_episodes(state, integers, which):
     """Set all that an episode counts and sums up to its beginning, and the belt to its nominal speed."""
     for i in which:
-        for row in range(S_TRAVEL, STATE_ROWS):
+        for row in range(S_TRAVEL, S_FRICTION):
             state[row, i] = 0.0
         state[S_BELT, i] = state[S_BELT_SPEED, i]
         state[S_LATE_LOW, i] = math.inf
@@ -2525,23 +3346,23 @@ def blank_episodes(state, integers, which):
 
 
 @compiled
-def place_on_cycle(state, integers, which, points, period, slot):
-    """Put the environments ``which`` (k,) at random phases (numbers of ``slot``) of the passive motion with these
-    :func:`cycle_points`."""
+def place_on_cycle(state, integers, which, points, period, slot, beyond):
+    """Put the environments ``which`` (k,) at random phases (numbers of ``slot``) of the passive, unexcited motion with
+    these :func:`cycle_points`."""
     for i in which:
         phase = random_uniform(int(integers[I_KEY, i]), int(integers[I_EPISODE, i]), 0, slot)
-        plant = _plant_of(state, integers, i)
+        plant = calm(_plant_of(state, integers, i, 0.0, beyond))
         state[S_X, i], state[S_V, i] = cycle_state(plant, points, state[S_BELT_SPEED, i], period, phase)
 
 
 @compiled
-def restart(task, codes, state, integers, past, shown, observations, which, points, period, slot):
+def restart(task, codes, state, integers, past, shown, observations, which, points, period, slot, beyond):
     """Begin the next episodes of the environments ``which`` (k,), with the parameters that they have, where
     :func:`place_on_cycle` puts them; observe them."""
     for i in which:
         integers[I_EPISODE, i] += 1
     blank_episodes(state, integers, which)
-    place_on_cycle(state, integers, which, points, period, slot)
+    place_on_cycle(state, integers, which, points, period, slot, beyond)
     observe(task, codes, state, integers, past, shown, observations, which)
 
 
@@ -2569,11 +3390,20 @@ def episode_statistics(state, integers, which, replaced, values):
 
 
 @compiled
-def contact(state, integers, which, modes, normal_forces):
-    """Write the mode and the normal force of the environments ``which`` (k,), which have just been reset, (k,) each."""
+def left_alone(plant, x, v, v_belt):
+    """Return the mode, the belt's speed, the velocity relative to it and the normal force of a mass left alone."""
+    mode = mode_of(plant, x, v, v_belt, 0.0, 0.0)
+    speed, v_rel = _shown_belt(plant.laws, mode, v, v_belt)
+    return mode, speed, v_rel, spring(plant, x)[1]
+
+
+@compiled
+def contact(state, integers, which, modes, v_belts, v_rels, normal_forces, beyond):
+    """Write the mode, the belt's speed, the velocity relative to it and the normal force of the environments ``which``
+    (k,), which have just been reset, (k,) each."""
     for j in range(len(which)):
         i = which[j]
-        plant = _plant_of(state, integers, i)
-        x, belt = state[S_X, i], state[S_BELT, i]
-        modes[j] = mode_of(plant, x, state[S_V, i], belt, 0.0, 0.0)
-        normal_forces[j] = spring(plant, x)[1]
+        plant = _plant_of(state, integers, i, 0.0, beyond)
+        modes[j], v_belts[j], v_rels[j], normal_forces[j] = left_alone(
+            plant, state[S_X, i], state[S_V, i], state[S_BELT, i]
+        )

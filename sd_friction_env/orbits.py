@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 
 from sd_friction_env import kernel
-from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_number
+from sd_friction_env.parameters import RANGES, STATE_LIMIT, OscillatorParameters, checked_number
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.theory import FloatArray, cubic_wells, exact_wells
 
@@ -121,7 +121,13 @@ def balance_points(parameters: OscillatorParameters, load: float, coefficient: f
     alpha, g1 = parameters.alpha, parameters.g1
     if parameters.geometry == "linear":
         return [coefficient * g1 - load]
-    if parameters.geometry == "cubic":
+    if parameters.geometry_code == kernel.DISCONTINUOUS:
+        # Where the jump of R at x = 0 passes the balance there is no place to stand on: see `stick_intervals` for that.
+        push = coefficient * g1 - load
+        return sorted(push + side for side in (-1.0, 1.0) if (push + side) * side > 0.0)
+    if parameters.geometry == "duffing":
+        polynomial = [parameters.kappa, 0.0, 1.0, load - coefficient * g1]
+    elif parameters.geometry == "cubic":
         square = alpha * alpha
         polynomial = [
             0.5 / (square * alpha),
@@ -159,7 +165,7 @@ def balance_points(parameters: OscillatorParameters, load: float, coefficient: f
 
 def rest_place(parameters: OscillatorParameters) -> float:
     """Return where the unloaded spring has its (right-hand) place of rest, R(x) = 0 with R'(x) > 0."""
-    wells = {"exact": exact_wells, "cubic": cubic_wells}.get(parameters.geometry)
+    wells = {"exact": exact_wells, "cubic": cubic_wells}.get(parameters.geometry)  # alpha = 0 has its own at 1
     return wells(parameters.alpha)[-1] if wells else 0.0
 
 
@@ -168,6 +174,7 @@ def equilibria(parameters: OscillatorParameters) -> list[Equilibrium]:
 
     Source: Eq. 11 for the cubic geometry; the same balance of forces for the others.
     """
+    _check_unexcited(parameters)
     speed = parameters.belt_speed
     if speed == 0.0:
         return []
@@ -188,6 +195,14 @@ def equilibria(parameters: OscillatorParameters) -> list[Equilibrium]:
     return found
 
 
+def _check_unexcited(parameters: OscillatorParameters) -> None:
+    if parameters.excited:
+        raise ValueError(
+            "parameters must be without excitation here (force_amplitude, ripple_amplitude and stiffness_amplitude 0), "
+            f"got {parameters!r}: see sd_friction_env.forced, or take parameters.unexcited"
+        )
+
+
 def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | None = None) -> LimitCycle:
     """Return the attractor that the passive oscillator reaches from (x, v).
 
@@ -197,8 +212,9 @@ def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | Non
 
     Raises:
         OrbitError: if the motion loses contact (N <= 0) or does not settle.
-        TypeError, ValueError: if x or v is not a number in its range.
+        TypeError, ValueError: if x or v is not a number in its range, or the oscillator is excited.
     """
+    _check_unexcited(parameters)
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
     v = parameters.belt_speed if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
     at_x, at_v = x, v
@@ -379,8 +395,12 @@ def slip_cycles(parameters: OscillatorParameters) -> list[LimitCycle]:
 
 def stick_intervals(parameters: OscillatorParameters) -> list[tuple[float, float]]:
     """Return the intervals of x in which a mass can stick, |2 beta v_b + R(x)| <= mu_s N(x), in ascending order."""
+    _check_unexcited(parameters)
     load = 2.0 * parameters.beta * parameters.belt_speed
-    ends = sorted(x for side in (-1.0, 1.0) for x in balance_points(parameters, load, side * parameters.mu_s))
+    ends = [x for side in (-1.0, 1.0) for x in balance_points(parameters, load, side * parameters.mu_s)]
+    if parameters.geometry_code == kernel.DISCONTINUOUS:
+        ends.append(0.0)  # the stick load jumps there, and an interval may end or be passed through
+    ends.sort()
     intervals: list[tuple[float, float]] = []
     for low, high in itertools.pairwise(ends):
         force, limit = kernel.stick_load(parameters.plant, 0.5 * (low + high), parameters.belt_speed, 0.0, 0.0)
@@ -530,12 +550,28 @@ def hopf_belt_speed(parameters: OscillatorParameters) -> float:
         normal = kernel.spring(plant, points[-1])[1]
         return float(2.0 * parameters.beta + normal * kernel.friction_slope(plant, kernel.SLIP_BACKWARD, -speed))
 
-    high = parameters.v_m  # friction rises with speed from here on
-    for low in np.linspace(high, 0.0, 65)[1:]:
-        if damping(float(low)) < 0.0:
-            return root(damping, float(low), high) if damping(high) > 0.0 else high
-        high = float(low)
+    _check_unexcited(parameters)
+    speeds = _belt_speeds_to_search(parameters)
+    high = float(speeds[0])
+    for low in speeds[1:].tolist():
+        if damping(low) < 0.0:
+            return root(damping, low, high) if damping(high) > 0.0 else high
+        high = low
     return math.nan
+
+
+def _belt_speeds_to_search(parameters: OscillatorParameters) -> FloatArray:
+    """Return belt speeds, descending to 0 from one above which friction no longer falls as steeply as damping rises."""
+    if parameters.friction == "stribeck":
+        speeds: FloatArray = np.linspace(parameters.v_m, 0.0, 65)  # friction rises with speed from there on
+        return speeds
+    high = RANGES["belt_speed"][1]
+    if parameters.friction == "coulomb":
+        speeds = np.array([high, 0.0])  # level: it never feeds a motion
+    else:
+        low = 1e-3 * (parameters.v_0 if parameters.friction == "exponential" else 1.0 / max(parameters.delta, 1e-3))
+        speeds = np.append(np.geomspace(high, min(low, 0.5 * high), 200), 0.0)
+    return speeds
 
 
 def first_lyapunov_coefficient(parameters: OscillatorParameters) -> float:
@@ -552,7 +588,7 @@ def first_lyapunov_coefficient(parameters: OscillatorParameters) -> float:
     plant, x = at_hopf.plant, equilibria(at_hopf)[-1].x
     coefficient = float(kernel.friction_coefficient(plant, kernel.SLIP_BACKWARD, -speed))
     slope = float(kernel.friction_slope(plant, kernel.SLIP_BACKWARD, -speed))
-    curvature, third = -6.0 * at_hopf.k3 * speed, 6.0 * at_hopf.k3
+    curvature, third = _friction_derivatives(at_hopf)
     restoring_slope, normal_slope = kernel.spring_slopes(plant, x)
     restoring_curvature, normal_curvature = kernel.spring_curvatures(plant, x)
     normal = kernel.spring(plant, x)[1]
@@ -565,10 +601,26 @@ def first_lyapunov_coefficient(parameters: OscillatorParameters) -> float:
     return float((f_xxv + square * f_vvv + f_xv * f_xx / square + f_xv * f_vv) / 16.0)
 
 
+def _friction_derivatives(parameters: OscillatorParameters) -> tuple[float, float]:
+    """Return the second and third derivatives of mu at the relative velocity of steady slip, -v_b."""
+    speed = parameters.belt_speed
+    if parameters.friction == "stribeck":
+        return -6.0 * parameters.k3 * speed, 6.0 * parameters.k3
+    if parameters.friction == "hyperbolic":
+        delta, below = parameters.delta, 1.0 + parameters.delta * speed
+        return -2.0 * parameters.mu_s * delta**2 / below**3, -6.0 * parameters.mu_s * delta**3 / below**4
+    if parameters.friction == "exponential":
+        v_0 = parameters.v_0
+        fall = (parameters.mu_s - parameters.mu_k) * math.exp(-speed / v_0)
+        return -fall / v_0**2, -fall / v_0**3
+    return 0.0, 0.0
+
+
 def grazing_belt_speed(parameters: OscillatorParameters) -> float:
     """Return v_b0, the largest belt speed at which a mass that breaks away sticks again, or NaN if it never does.
 
-    The mass breaks away at the right end of the right-most stick interval. ``belt_speed`` is not used.
+    The mass breaks away at the right end of the right-most stick interval. ``belt_speed`` is not used. With a friction
+    law other than Stribeck's the search ends at 10, the greatest belt speed that is accepted.
     """
     plant = parameters.plant
 
@@ -578,8 +630,17 @@ def grazing_belt_speed(parameters: OscillatorParameters) -> float:
             return False
         return bool(kernel.slip_returns_to_stick(plant, speed, ends[-1]))
 
-    high = 1.5 * parameters.v_m
-    for low in np.linspace(high, 0.0, 49)[1:-1]:
+    _check_unexcited(parameters)
+    if parameters.friction == "stribeck":
+        speeds = np.linspace(1.5 * parameters.v_m, 0.0, 49)
+    else:
+        speeds = _belt_speeds_to_search(parameters)
+        if parameters.friction == "coulomb":
+            speeds = np.append(np.geomspace(speeds[0], 1e-3, 200), 0.0)
+    high = float(speeds[0])
+    if parameters.friction != "stribeck" and sticks_again(high):
+        return high
+    for low in speeds[1:-1]:
         if sticks_again(float(low)):
             inside, outside = float(low), high
             while True:
@@ -601,7 +662,7 @@ def critical_belt_speeds(parameters: OscillatorParameters) -> CriticalBeltSpeeds
     is not used. alpha < 1 has several wells: the speeds are those of the right-hand well, where the belt takes a mass.
     """
     v_b1 = hopf_belt_speed(parameters)
-    if math.isnan(v_b1):
+    if math.isnan(v_b1) and parameters.friction == "stribeck":
         return CriticalBeltSpeeds(
             math.nan,
             math.nan,
@@ -609,5 +670,7 @@ def critical_belt_speeds(parameters: OscillatorParameters) -> CriticalBeltSpeeds
             "2 beta + N mu'(-v_b) >= 0 (on a level spring: (mu_s - mu_m)/v_m <= 4 beta/(3 N))",
         )
     v_b0 = grazing_belt_speed(parameters)
-    reason = "no breakaway is followed by another stick" if math.isnan(v_b0) else ""
-    return CriticalBeltSpeeds(v_b0, v_b1, reason)
+    reasons = ["no breakaway is followed by another stick"] if math.isnan(v_b0) else []
+    if math.isnan(v_b1):
+        reasons.append("steady slip is stable at every belt speed, 2 beta + N mu'(-v_b) >= 0")
+    return CriticalBeltSpeeds(v_b0, v_b1, "; ".join(reasons))

@@ -24,7 +24,8 @@ class Event(NamedTuple):
     """A change of mode: its time, its kind and the state there.
 
     Kinds: "restick" (slip ends in stick), "crossing" (v_rel changes sign without sticking), "grazing" (v_rel touches
-    zero), "breakaway" (stick ends), "contact-loss" (N falls to zero; the history ends).
+    zero), "breakaway" (stick ends), "switching" (x passes 0 where alpha = 0), "contact-loss" (N falls to zero; the
+    history ends).
     """
 
     time: float
@@ -35,28 +36,30 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class EnergyBalance:
-    """Where the energy went: change = damping + contact + control, each a work done on the mass.
+    """Where the energy went: change = damping + contact + control + excitation, each a work done on the mass.
 
     Attributes:
         change: of x'^2/2 + V(x). damping: -2 beta times the integral of x'^2. contact: work of the contact force.
-        control: work of the control force. residual: change minus the rest. relative_residual: the residual over the
-            sum of the absolute works (0 if nothing moved).
+        control: work of the control force. excitation: work of the exciting force and of what modulates the stiffness.
+        residual: change minus the rest. relative_residual: the residual over the sum of the absolute works (0 if
+            nothing moved).
     """
 
     change: float
     damping: float
     contact: float
     control: float
+    excitation: float = 0.0
 
     @property
     def residual(self) -> float:
         """The part of the change that no work explains; zero but for integration errors."""
-        return self.change - self.damping - self.contact - self.control
+        return self.change - self.damping - self.contact - self.control - self.excitation
 
     @property
     def relative_residual(self) -> float:
         """The residual over the sum of the absolute works."""
-        works = abs(self.damping) + abs(self.contact) + abs(self.control)
+        works = abs(self.damping) + abs(self.contact) + abs(self.control) + abs(self.excitation)
         return abs(self.residual) / works if works > 0.0 else 0.0
 
 
@@ -116,7 +119,7 @@ def simulate(
 
     Args:
         parameters: of the oscillator; the belt starts at ``parameters.belt_speed``.
-        x, v: the start, in [-10, 10]; v defaults to the belt speed.
+        x, v: the start, in [-10, 10]; v defaults to the belt speed, ripple included.
         t_end: when to end, in [0, 1e7].
         dt: time between samples, in [1e-6, 1e6].
         force: control force u: a number, or values of shape (m,), each held for ``hold``.
@@ -127,7 +130,7 @@ def simulate(
         TypeError, ValueError: if an argument is not as said.
     """
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
-    v = parameters.belt_speed if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
+    v = parameters.first_belt_speed if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
     t_end = checked_number("t_end", t_end, 0.0, 1e7)
     dt = checked_number("dt", dt, 1e-6, 1e6)
     if t_end / dt > _MOST_SAMPLES:
@@ -153,10 +156,10 @@ def simulate(
     belt = parameters.belt_speed
     grid = dt * np.arange(math.floor(t_end / dt * (1.0 + 1e-12)) + 1)
     grid = np.append(grid[grid < t_end * (1.0 - 1e-12)], t_end) if t_end > 0.0 else np.zeros(1)
-    start_energy = 0.5 * v * v + kernel.potential(plant, x)
+    start_energy = 0.5 * v * v + kernel.energy_in_spring(plant, x)
     parts = [np.array([[0.0, x, v, belt, kernel.mode_of(plant, x, v, belt, accelerations[0], forces[0])]])]
     events: list[Event] = []
-    damping = contact = control = stick_time = 0.0
+    damping = contact = control = excitation = stick_time = 0.0
     status = kernel.OK
     segment, begin = 0, 0.0
     while begin < t_end and status == kernel.OK:
@@ -174,9 +177,12 @@ def simulate(
             piece = times[done : done + _CHUNK] - (t0 - begin)
             samples = np.empty((piece.size, 4))
             buffer = np.empty((max(4 * kernel.MAX_EVENTS, piece.size), 4))
+            now = kernel.later(plant, t0)
             taken, n_events, status, reached, int_v2, stuck, int_fv = kernel.trace(
-                plant, x, v, belt0, a_belt, u, piece, samples, buffer
+                now, x, v, belt0, a_belt, u, piece, samples, buffer
             )
+            if parameters.excited:
+                excitation += kernel.excitation_work(now, x, v, belt0, a_belt, u, reached, buffer[:n_events])
             events += [Event(t0 + e[0], kernel.EVENT_NAMES[int(e[1])], e[2], e[3]) for e in buffer[:n_events].tolist()]
             damping -= 2.0 * parameters.beta * int_v2
             contact += int_fv
@@ -195,6 +201,9 @@ def simulate(
         control += u * (x - x_begin)
         segment, begin = segment + 1, end
     table = np.concatenate(parts)
+    if parameters.ripple_amplitude > 0.0:
+        angles = parameters.ripple_frequency * table[:, 0] + parameters.ripple_phase
+        table[:, 3] += parameters.ripple_amplitude * np.cos(angles)
     return Trajectory(
         t=table[:, 0],
         x=table[:, 1],
@@ -204,10 +213,11 @@ def simulate(
         events=tuple(events),
         stick_time=stick_time,
         energy=EnergyBalance(
-            change=0.5 * v * v + kernel.potential(plant, x) - start_energy,
+            change=0.5 * v * v + kernel.energy_in_spring(kernel.later(plant, t0), x) - start_energy,
             damping=damping,
             contact=contact,
             control=control,
+            excitation=excitation,
         ),
         status=kernel.STATUS_NAMES[status],
         parameters=parameters,

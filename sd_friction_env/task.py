@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from sd_friction_env import kernel
 from sd_friction_env.orbits import LimitCycle, OrbitError, equilibria, limit_cycle, rest_place
-from sd_friction_env.parameters import RANGES, STATE_LIMIT, OscillatorParameters, checked_choice, checked_number
+from sd_friction_env.parameters import (
+    EXCITATIONS,
+    RANGES,
+    SMALLEST_ALPHA,
+    STATE_LIMIT,
+    OscillatorParameters,
+    checked_choice,
+    checked_number,
+)
 
 Actuator = Literal["force", "belt_speed"]
 Start = Literal["cycle", "rest", "random"]
@@ -20,7 +28,10 @@ Sensor = Literal["state", "position"]
 FloatArray: TypeAlias = NDArray[np.float64]
 IntegerArray: TypeAlias = NDArray[np.int64]
 
-RANDOMISABLE = ("alpha", "g1", "beta", "mu_s", "mu_m", "v_m", "belt_speed")
+RANDOMISABLE = (  # each has its own random numbers, by its place here
+    *("alpha", "g1", "beta", "mu_s", "mu_m", "v_m", "belt_speed", "mu_k", "delta", "v_0", "mu_v", "kappa"),
+    *(f"{kind}_{what}" for kind in EXCITATIONS for what in ("amplitude", "frequency", "phase")),
+)
 
 # Slots of the counter-based generator at step 0 of an episode; sensor noise uses the steps from 1 on.
 PHASE_SLOT, _X_SLOT, _V_SLOT, _PARAMETER_SLOT = 0, 1, 2, 8  # of the random numbers with which an episode begins
@@ -60,6 +71,8 @@ class Task:
         kick: velocity given to a mass that starts at its equilibrium.
         randomise: parameters drawn evenly from (low, high) at each reset, by name.
         show_parameters: whether the observation ends with the randomised parameters, each scaled to [-1, 1].
+        show_phases: whether the observation holds the cosine and sine of the phase of each excitation (force, ripple,
+            stiffness); without it they are hidden.
         sensor: "state" (x, v and, with the belt actuator, the belt's modulation) or "position" (x alone).
         sensor_noise: standard deviation of the noise on x (and v), in [0, 10].
         sensor_delay: age of what is seen, in control intervals, 0 to 1000.
@@ -86,6 +99,7 @@ class Task:
     kick: float = 0.1
     randomise: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     show_parameters: bool = False
+    show_phases: bool = False
     sensor: Sensor = "state"
     sensor_noise: float = 0.0
     sensor_delay: int = 0
@@ -110,8 +124,9 @@ class Task:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, checked_number(name, value, low, high))
-        if not isinstance(self.show_parameters, bool):
-            raise TypeError(f"show_parameters must be True or False, got {self.show_parameters!r}")
+        for name in ("show_parameters", "show_phases"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name} must be True or False, got {getattr(self, name)!r}")
         object.__setattr__(self, "randomise", _checked_randomisation(self.randomise))
 
     @classmethod
@@ -142,9 +157,11 @@ class Task:
         return self.episode_steps - max(1, self.episode_steps // 4)
 
     def with_scales(self, nominal: OscillatorParameters) -> Self:
-        """Return the task with the observation scales that were left open taken from the nominal plant's motion."""
+        """Return the task with the observation scales that were left open taken from the nominal plant's unexcited
+        motion."""
         if None not in (self.x_offset, self.x_scale, self.v_scale):
             return self
+        nominal = nominal.unexcited
         cycle = passive_motion(nominal)
         places = equilibria(nominal)
         place = 0.5 * (cycle.x_max + cycle.x_min) if cycle else 0.0
@@ -215,7 +232,9 @@ class Task:
         return self.cycle_state(parameters, float(self.phases(keys, episodes)[0]))
 
     def cycle_state(self, parameters: OscillatorParameters, phase: float) -> tuple[float, float]:
-        """Return the passive cycle's state at a phase in [0, 1], or the kicked equilibrium where nothing oscillates."""
+        """Return the passive, unexcited cycle's state at a phase in [0, 1], or the kicked equilibrium where nothing
+        oscillates."""
+        parameters = parameters.unexcited
         cycle = passive_motion(parameters)
         if cycle is None:
             places = equilibria(parameters)
@@ -240,15 +259,20 @@ def _checked_randomisation(randomise: Any) -> dict[str, tuple[float, float]]:
         high = checked_number(f"randomise[{name!r}] high", high, *RANGES[name])
         if low > high:
             raise ValueError(f"randomise[{name!r}] must have low <= high, got {interval!r}")
+        if name == "alpha" and low < SMALLEST_ALPHA and high > 0.0:
+            raise ValueError(
+                f"randomise['alpha'] low must be at least {SMALLEST_ALPHA:g} where alpha varies, got {low!r}"
+            )
         checked[name] = (low, high)
     return dict(sorted(checked.items()))
 
 
 @functools.lru_cache(maxsize=4096)
 def passive_motion(parameters: OscillatorParameters) -> LimitCycle | None:
-    """Return the attractor of a mass set down at x = 0 with the belt; None if it loses contact or does not settle."""
+    """Return the attractor of a mass set down at x = 0 with the belt, without excitation; None if it loses contact or
+    does not settle."""
     try:
-        return limit_cycle(parameters)
+        return limit_cycle(parameters.unexcited)
     except OrbitError:
         return None
 

@@ -30,7 +30,17 @@ from sd_friction_env.env import (
     write_state,
 )
 from sd_friction_env.orbits import rest_place
-from sd_friction_env.parameters import GEOMETRIES, RANGES, OscillatorParameters, checked_choice, checked_number
+from sd_friction_env.parameters import (
+    EXCITATIONS,
+    FRICTION_CODES,
+    FRICTIONS,
+    GEOMETRIES,
+    RANGES,
+    OscillatorParameters,
+    checked_choice,
+    checked_number,
+    law_numbers,
+)
 from sd_friction_env.startup import announced
 from sd_friction_env.task import PHASE_SLOT, FloatArray, IntegerArray, passive_motion
 from sd_friction_env.theory import stribeck_coefficients
@@ -74,8 +84,22 @@ _STATE_ROWS = {
     "beta": kernel.S_BETA,
     "mu_s": kernel.S_MU_S,
     "belt_speed": kernel.S_BELT_SPEED,
+    **{name: kernel.S_MU_K + i for i, name in enumerate(law_numbers("exponential"))},
 }
+_GEOMETRIES = np.array([*GEOMETRIES, "exact"], object)  # by the kernel's numbers: the last has alpha = 0
+_FRICTIONS = np.array(FRICTIONS, object)
+_AMPLITUDES = [_STATE_ROWS[f"{kind}_amplitude"] for kind in EXCITATIONS]
 _STATE_METHODS = ("reset", "set_state", "step")  # of the single environment
+
+
+def _kinds_of(parameters: OscillatorParameters) -> IntegerArray:
+    """Return the kernel's numbers of the geometry and of the friction law, (2, 1)."""
+    return np.array([[parameters.geometry_code], [FRICTION_CODES[parameters.friction]]])
+
+
+def _kinds(state: FloatArray, integers: IntegerArray, i: int) -> IntegerArray:
+    """Return the same of a column of the kernel's arrays, (2,)."""
+    return np.array([integers[kernel.I_GEOMETRY, i], int(state[kernel.S_FRICTION, i])])
 
 
 class _Buffers(NamedTuple):
@@ -95,6 +119,7 @@ class _Starts(NamedTuple):
     state: FloatArray  # columns of the kernel's arrays
     integers: IntegerArray
     own: NDArray[np.bool_]  # who has other parameters than the nominal ones
+    beyond: bool  # whether any has laws beyond the paper's
 
 
 class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
@@ -194,7 +219,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self.action_space = batch_space(self.single_action_space, n)
 
         task = self.task
-        self._geometry = self.nominal.plant.geometry
+        self._nominal_kinds = _kinds_of(self.nominal)
+        self._beyond: kernel.Laws | None = None  # not None where any environment has laws beyond the paper's
         self._nominal_numbers = np.array([[getattr(self.nominal, name)] for name in _NUMBERS])
         self._task_numbers, self._task_codes = task_arrays(task)
         # Rows of an odd number of cache lines: lengths of a power of two would crowd into few places of the cache.
@@ -242,8 +268,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
 
     def _make_what_does_not_travel(self) -> None:
         """Make what a copy has to make anew: compiled code, and arrays that cannot be written to."""
-        self._stepper = (kernel.STEPPERS if len(self._works) == 1 else kernel.STEPPERS_IN_THREADS)[self._geometry]
-        self._is_warm = False
+        self._choose_stepper()
         self._kept: _Buffers | None = None
         # What holds for all is one array for all steps.
         self._all = np.ones(self.num_envs, np.bool_)
@@ -251,6 +276,15 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         for shared in (self._all, self._all_ok):
             shared.setflags(write=False)
         self._masks = {f"_{name}": self._all for name in self.step_keys}
+
+    def _choose_stepper(self) -> None:
+        alone = len(self._works) == 1
+        if self._beyond or self.nominal.beyond:
+            self._stepper = kernel.step_beyond if alone else kernel.step_beyond_in_threads
+        else:
+            steppers = kernel.STEPPERS if alone else kernel.STEPPERS_IN_THREADS
+            self._stepper = steppers[self.nominal.geometry_code]
+        self._is_warm = False
 
     def __getstate__(self) -> dict[str, Any]:
         anew = ("_stepper", "_is_warm", "_kept", "_all", "_all_ok", "_masks")
@@ -294,9 +328,9 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
                 keys[place], episodes[place] = seeding.np_random(seeds[i])[0].integers(2**62), 0
             elif stream is not None:
                 keys[place], episodes[place] = stream.integers(2**62), 0
-        parameters, geometries = self._drawn(keys, episodes)
-        given = self._given(which, keys, episodes, per_env, parameters, geometries)
-        starts = self._prepared(which, keys, episodes, parameters, geometries, *given)
+        parameters, kinds = self._drawn(keys, episodes)
+        given = self._given(which, keys, episodes, per_env, parameters, kinds)
+        starts = self._prepared(which, keys, episodes, parameters, kinds, *given)
         # Nothing can go wrong from here on, and only now is anything changed.
         if stream is not None:
             self.np_random.bit_generator.state = stream.bit_generator.state
@@ -309,11 +343,12 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         return self._observations.copy() if self.copy else self._observations, info
 
     def _drawn(self, keys: IntegerArray, episodes: IntegerArray) -> tuple[FloatArray, IntegerArray]:
-        """Return the parameters (rows: ``_NUMBERS``) and the geometries with which episodes begin."""
+        """Return the parameters (rows: ``_NUMBERS``) and the kinds (2, k), geometry and friction, with which episodes
+        begin."""
         parameters = np.repeat(self._nominal_numbers, len(keys), axis=1)
         for name, values in self.task.draws(keys, episodes).items():
             parameters[_NUMBERS.index(name)] = values
-        return parameters, np.full(len(keys), self._geometry, np.int64)
+        return parameters, np.repeat(self._nominal_kinds, len(keys), axis=1)
 
     def _given(
         self,
@@ -322,27 +357,28 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         episodes: IntegerArray,
         per_env: list[dict[str, Any]] | None,
         parameters: FloatArray,
-        geometries: IntegerArray,
+        kinds: IntegerArray,
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Put what options say into parameters and geometries; return the starts that they ask for, and for whom."""
+        """Put what options say into parameters and kinds; return the starts that they ask for, and for whom."""
         x, v, placed = np.zeros(len(which)), np.zeros(len(which)), np.zeros(len(which), np.bool_)
         for place, i in enumerate(which.tolist() if per_env is not None else []):
             assert per_env is not None
             options = per_env[i]
-            own = self._as_parameters(parameters[:, place], geometries[place])
+            own = self._as_parameters(parameters[:, place], kinds[:, place])
             if "parameters" in options:
                 own = own.replace(**options["parameters"])
                 check_belt(own)
                 parameters[:, place] = [getattr(own, name) for name in _NUMBERS]
-                geometries[place] = own.plant.geometry
+                kinds[:, place] = _kinds_of(own)[:, 0]
             if any(name in options for name in ("x", "phase", "start")):
                 x[place], v[place] = start_of(self.task, own, options, int(keys[place]), int(episodes[place]))
                 placed[place] = True
         return x, v, placed
 
-    def _as_parameters(self, numbers: FloatArray, geometry: int) -> OscillatorParameters:
+    def _as_parameters(self, numbers: FloatArray, kinds: IntegerArray) -> OscillatorParameters:
         values = dict(zip(_NUMBERS, numbers.tolist(), strict=True))
-        return self.nominal.replace(geometry=GEOMETRIES[geometry], **values)
+        geometry, friction = kinds.tolist()
+        return self.nominal.replace(geometry=_GEOMETRIES[geometry], friction=_FRICTIONS[friction], **values)
 
     def _prepared(
         self,
@@ -350,7 +386,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         keys: IntegerArray,
         episodes: IntegerArray,
         parameters: FloatArray,
-        geometries: IntegerArray,
+        kinds: IntegerArray,
         x: FloatArray,
         v: FloatArray,
         placed: NDArray[np.bool_],
@@ -367,10 +403,14 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         state[kernel.S_K1], state[kernel.S_K3] = stribeck_coefficients(mu_s, mu_m, v_m)
         state[kernel.S_X], state[kernel.S_V] = x, v
         integers[kernel.I_KEY], integers[kernel.I_EPISODE] = keys, episodes
-        integers[kernel.I_GEOMETRY] = geometries
+        integers[kernel.I_GEOMETRY], state[kernel.S_FRICTION] = kinds
+        hyperbolic = kinds[1] == kernel.HYPERBOLIC
+        state[kernel.S_DECAY, hyperbolic] = parameters[_NUMBERS.index("delta"), hyperbolic]
         kernel.blank_episodes(state, integers, np.arange(len(which)))
-        own = (geometries != self._geometry) | (parameters != self._nominal_numbers).any(axis=0)
-        starts = _Starts(which, parameters, state, integers, own)
+        own = (kinds != self._nominal_kinds).any(axis=0) | (parameters != self._nominal_numbers).any(axis=0)
+        beyond = bool((kinds[1] != kernel.STRIBECK).any() or (kinds[0] >= kernel.DUFFING).any())
+        beyond = beyond or bool(state[_AMPLITUDES].any())
+        starts = _Starts(which, parameters, state, integers, own, beyond)
         self._place(starts, np.flatnonzero(~placed))
         return starts
 
@@ -378,6 +418,10 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         """Start episodes; they are not observed yet."""
         which = starts.which
         here = slice(self.num_envs) if len(which) == self.num_envs else which  # in one go, where that is possible
+        beyond = kernel.NO_LAWS if starts.beyond or (self._beyond and len(which) < self.num_envs) else None
+        if beyond != self._beyond:
+            self._beyond = beyond
+            self._choose_stepper()
         self._numbers[:, here] = starts.numbers
         self._state[:, here] = starts.state
         self._integers[:, here] = starts.integers
@@ -409,11 +453,13 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         own = starts.own[columns]
         left = columns[own]
         with announced("starts in a batch"):
-            kernel.place_on_cycle(state, integers, columns[~own], *self._nominal_start)
+            beyond = kernel.NO_LAWS if starts.beyond else None
+            kernel.place_on_cycle(state, integers, columns[~own], *self._nominal_start, beyond)
             if task.start == "cycle":
-                left = left[kernel.own_cycle_starts(state, integers, left, task.phases(keys, episodes)[own]) == 1]
+                phases = task.phases(keys, episodes)[own]
+                left = left[kernel.own_cycle_starts(state, integers, left, phases, beyond) == 1]
         for j in left.tolist():
-            single = self._as_parameters(starts.numbers[:, j], int(integers[kernel.I_GEOMETRY, j]))
+            single = self._as_parameters(starts.numbers[:, j], _kinds(state, integers, j))
             key, episode = integers[[kernel.I_KEY, kernel.I_EPISODE], j].tolist()
             state[kernel.S_X, j], state[kernel.S_V, j] = task.start_state(single, key, episode)
 
@@ -444,14 +490,13 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     def _at_start(self, which: IntegerArray) -> dict[str, NDArray[Any]]:
         """Return what info says of environments (k,) that have just been reset, each (k,)."""
         state = self._state
-        x, v, v_belt = state[kernel.S_X, which], state[kernel.S_V, which], state[kernel.S_BELT, which]
-        mode, normal_force = np.empty(len(which), np.int64), np.empty(len(which))
-        kernel.contact(state, self._integers, which, mode, normal_force)
+        mode, (v_belt, v_rel, normal_force) = np.empty(len(which), np.int64), np.empty((3, len(which)))
+        kernel.contact(state, self._integers, which, mode, v_belt, v_rel, normal_force, self._beyond)
         return {
-            "x": x,
-            "v": v,
+            "x": state[kernel.S_X, which],
+            "v": state[kernel.S_V, which],
             "v_belt": v_belt,
-            "v_rel": v - v_belt,
+            "v_rel": v_rel,
             "mode": mode,
             "normal_force": normal_force,
             "time": np.zeros(len(which)),
@@ -466,9 +511,10 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         return info
 
     def _parameters_info(self, which: IntegerArray, mask: NDArray[np.bool_]) -> dict[str, Any]:
-        geometries = np.full(self.num_envs, None, object)
-        geometries[which] = np.array(GEOMETRIES, object)[self._integers[kernel.I_GEOMETRY, which]]
-        info: dict[str, Any] = {"geometry": geometries, "_geometry": mask}
+        geometries, frictions = np.full((2, self.num_envs), None, object)
+        geometries[which] = _GEOMETRIES[self._integers[kernel.I_GEOMETRY, which]]
+        frictions[which] = _FRICTIONS[self._state[kernel.S_FRICTION, which].astype(np.int64)]
+        info: dict[str, Any] = {"geometry": geometries, "_geometry": mask, "friction": frictions, "_friction": mask}
         for row, name in enumerate(_NUMBERS):
             info[name], info[f"_{name}"] = self._spread(self._numbers[row, which], which), mask
         return info
@@ -649,6 +695,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             self._observations,
             which,
             *self._nominal_start,
+            self._beyond,
         )
         self._clear_pictures(which)
 
@@ -734,7 +781,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         return tuple(self._state_of(i) for i in range(self.num_envs))
 
     def _state_of(self, i: int) -> EnvState:
-        parameters = self._as_parameters(self._numbers[:, i], int(self._integers[kernel.I_GEOMETRY, i]))
+        parameters = self._as_parameters(self._numbers[:, i], _kinds(self._state, self._integers, i))
         return read_state(parameters, self._state, self._integers, self._past, i)
 
     def set_states(self, states: Sequence[EnvState]) -> None:
@@ -758,12 +805,12 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     def _put_states(self, which: IntegerArray, states: Sequence[EnvState]) -> None:
         """Put (checked) states into environments."""
         numbers = np.array([[getattr(saved.parameters, name) for saved in states] for name in _NUMBERS])
-        geometries = np.array([saved.parameters.plant.geometry for saved in states])
+        kinds = np.hstack([_kinds_of(saved.parameters) for saved in states])
         keys = np.array([saved.key for saved in states])
         episodes = np.array([saved.episode for saved in states])
         elsewhere = np.zeros(len(which))  # write_state puts them in their places
         everywhere = np.ones(len(which), np.bool_)
-        self._begin(self._prepared(which, keys, episodes, numbers, geometries, elsewhere, elsewhere, everywhere))
+        self._begin(self._prepared(which, keys, episodes, numbers, kinds, elsewhere, elsewhere, everywhere))
         for i, saved in zip(which.tolist(), states, strict=True):
             write_state(saved, self._state, self._integers, self._past, i)
         over = np.array([saved.ended or saved.steps >= self.task.episode_steps for saved in states])

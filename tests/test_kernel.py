@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sd_friction_env import kernel
-from sd_friction_env.parameters import RANGES, STATE_LIMIT, OscillatorParameters
+from sd_friction_env.parameters import FRICTIONS, GEOMETRIES, RANGES, SMALLEST_ALPHA, STATE_LIMIT, OscillatorParameters
 
 EXACT = OscillatorParameters().plant
 CUBIC = OscillatorParameters(geometry="cubic").plant
@@ -89,8 +89,15 @@ def test_no_corner_of_what_is_accepted_defeats_the_error_rule():
         for name, (low, high) in corners.items():
             spread = math.exp(rng.uniform(math.log(max(low, 1e-4)), math.log(high)))
             values[name] = float(rng.choice([low, high, spread, spread]).clip(low, high))
-        values["mu_m"] = min(values["mu_m"], values["mu_s"])
-        p = OscillatorParameters(geometry=("exact", "cubic", "linear")[rng.integers(3)], **values)
+        for name in ("mu_m", "mu_k"):
+            values[name] = min(values[name], values["mu_s"])
+        geometry = GEOMETRIES[rng.integers(4)]
+        if values["alpha"] < SMALLEST_ALPHA:
+            values["alpha"] = 0.0 if geometry != "cubic" else SMALLEST_ALPHA
+        laws = {"geometry": geometry, "friction": FRICTIONS[rng.integers(4)]}
+        p = OscillatorParameters(**laws, **values)
+        if rng.integers(2):
+            p = p.unexcited.replace(friction="stribeck")
         x, v = rng.uniform(-STATE_LIMIT, STATE_LIMIT, 2)
         out = kernel.advance(p.plant, x, v, p.belt_speed, 0.0, 0.0, 0.1, None)
         assert out[4] in (kernel.OK, kernel.CONTACT_LOST), (p, x, v)

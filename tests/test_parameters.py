@@ -32,7 +32,7 @@ def test_defaults_are_the_nominal_plant():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("alpha", 0.0),
+        ("alpha", 5e-4),
         ("alpha", -0.5),
         ("alpha", math.nan),
         ("alpha", math.inf),
@@ -59,7 +59,7 @@ def test_a_value_of_the_wrong_type_is_refused(value):
 def test_mu_m_above_mu_s_and_unknown_geometry_and_unknown_name_are_refused():
     with pytest.raises(ValueError, match=r"mu_m must not exceed mu_s = 0\.1, got 0\.2"):
         OscillatorParameters(mu_s=0.1, mu_m=0.2)
-    with pytest.raises(ValueError, match="geometry must be one of 'exact', 'cubic', 'linear', got 'round'"):
+    with pytest.raises(ValueError, match="geometry must be one of 'exact', 'cubic', 'linear', 'duffing', got 'round'"):
         OscillatorParameters(geometry="round")
     with pytest.raises(ValueError, match="unknown parameter 'alfa'"):
         OscillatorParameters().replace(alfa=0.5)

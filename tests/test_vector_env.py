@@ -634,7 +634,7 @@ def unplaceable(monkeypatch):
     def refuse(*arguments):
         raise OrbitError("no start")
 
-    monkeypatch.setattr(kernel, "own_cycle_starts", lambda state, integers, which, phases: np.ones(len(which)))
+    monkeypatch.setattr(kernel, "own_cycle_starts", lambda state, integers, which, phases, beyond: np.ones(len(which)))
     monkeypatch.setattr(Task, "start_state", refuse)
 
 

@@ -1,6 +1,5 @@
 """Which attractor a start reaches: starts by the million, fractions of them, and grids to draw."""
 
-import dataclasses
 import itertools
 import math
 import os
@@ -49,7 +48,7 @@ class Basins:
         return share, math.sqrt(share * (1.0 - share) / self.labels.size)
 
 
-def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike) -> Basins:
+def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, threads: int | None = None) -> Basins:
     """Return the attractor that each start reaches.
 
     A start is followed only until it sticks (the end of its stick interval tells the rest) or passes a maximum of x
@@ -58,9 +57,10 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike) -> Basi
     Args:
         parameters: of the oscillator, with a moving belt.
         x, v: starts, broadcast against each other, each in [-10, 10].
+        threads: at most so many; None: as many as there are cores, where there are enough starts.
 
     Raises:
-        ValueError: if a start is not in its range, or the belt stands still.
+        ValueError: if a start is not in its range, the belt stands still or the oscillator is excited.
     """
     xs, vs = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(v, dtype=np.float64))
     for name, values in (("x", xs), ("v", vs)):
@@ -106,7 +106,7 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike) -> Basi
         kernel.classify(parameters.plant, parameters.belt_speed, flat_x[part], flat_v[part], *known, labels[part])
 
     # Starts do not know of each other: any number of threads gives the same labels. Few starts are not worth one.
-    threads = min(os.cpu_count() or 1, xs.size // _STARTS_WORTH_A_THREAD)
+    threads = min(threads or os.cpu_count() or 1, xs.size // _STARTS_WORTH_A_THREAD)
     if threads < 2:
         classify(slice(None))
     else:
@@ -159,6 +159,19 @@ def basin_grid(
     Raises:
         ValueError: if limits are reversed or out of range, or the shape is not of whole numbers from 2 on.
     """
+    x, v = checked_grid(x_limits, v_limits, shape)
+    grid_x, grid_v = np.meshgrid(x, v)
+    return x, v, basins(parameters, grid_x, grid_v)
+
+
+def checked_grid(
+    x_limits: tuple[float, float], v_limits: tuple[float, float], shape: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the axes of a grid, x of shape (n,) and v of shape (m,).
+
+    Raises:
+        ValueError: if limits are reversed or out of range, or the shape is not of whole numbers from 2 on.
+    """
     axes = []
     for name, (low, high), count in zip(("x_limits", "v_limits"), (x_limits, v_limits), shape, strict=True):
         low = checked_number(f"{name} low", low, -STATE_LIMIT, STATE_LIMIT)
@@ -168,5 +181,4 @@ def basin_grid(
         if count != int(count) or count < 2:
             raise ValueError(f"shape must hold whole numbers from 2 on, got {shape}")
         axes.append(np.linspace(low, high, int(count)))
-    grid_x, grid_v = np.meshgrid(*axes)
-    return axes[0], axes[1], dataclasses.replace(basins(parameters, grid_x, grid_v))
+    return axes[0], axes[1]

@@ -18,12 +18,12 @@ import gymnasium as gym
 import numpy as np
 
 import sd_friction_env
-from sd_friction_env import plotting
+from sd_friction_env import plotting, sweeps
 from sd_friction_env.basins import LOST_CONTACT, UNDECIDED, basin_grid
-from sd_friction_env.curves import amplitude_curve, attractor_curves, checked_belt_speeds
+from sd_friction_env.curves import checked_belt_speeds
 from sd_friction_env.doctor import as_text, examine, hyperparameter_folder
 from sd_friction_env.orbits import OrbitError, critical_belt_speeds, first_lyapunov_coefficient, limit_cycle
-from sd_friction_env.parameters import GEOMETRIES, RANGES, OscillatorParameters
+from sd_friction_env.parameters import FRICTIONS, GEOMETRIES, RANGES, OscillatorParameters
 from sd_friction_env.policies import Policy, VelocityFeedback, ZeroPolicy, load_policy
 from sd_friction_env.pretrained import load_pretrained
 from sd_friction_env.rendering import checked_size
@@ -41,6 +41,23 @@ _FIELDS = {
     "mu_m": "least kinetic friction coefficient",
     "v_m": "relative speed of least friction",
     "belt_speed": "belt speed v_b",
+}
+# Of other laws than the paper's.
+_LAW_FIELDS = {
+    "mu_k": "kinetic friction coefficient of coulomb and exponential",
+    "delta": "fall of the hyperbolic law, mu_s/(1 + delta |w|)",
+    "v_0": "speed of decay of the exponential law",
+    "mu_v": "viscous part of the exponential law",
+    "kappa": "stiffening of duffing, R = x + kappa x^3",
+    "force_amplitude": "exciting force",
+    "force_frequency": "its frequency, radians per unit of time",
+    "force_phase": "its phase, radians",
+    "ripple_amplitude": "ripple on the belt's speed",
+    "ripple_frequency": "its frequency",
+    "ripple_phase": "its phase",
+    "stiffness_amplitude": "modulation of the spring's force",
+    "stiffness_frequency": "its frequency",
+    "stiffness_phase": "its phase",
 }
 _MOST_POINTS = 10_000_000
 _TASKS = {"force": "Force", "belt": "BeltSpeed"}
@@ -109,14 +126,46 @@ def _command(
     parser.set_defaults(analysis=True)
     group = parser.add_argument_group("oscillator", "one or more values each, or start:stop:step; several make a grid")
     group.add_argument("--geometry", nargs="+", choices=GEOMETRIES, default=["exact"], help="forces (default: exact)")
+    group.add_argument(
+        "--friction", nargs="+", choices=FRICTIONS, default=["stribeck"], help="law of friction (default: stribeck)"
+    )
     nominal = OscillatorParameters()
-    for field, meaning in _FIELDS.items():
+    other = parser.add_argument_group("other laws, excitation", "likewise")
+    for field, meaning in (_FIELDS | _LAW_FIELDS).items():
         low, high = RANGES[field]
         text = f"{meaning}, in [{low:g}, {high:g}] (default: {getattr(nominal, field):g})"
-        group.add_argument(
+        (group if field in _FIELDS else other).add_argument(
             f"--{field.replace('_', '-')}", dest=field, nargs="+", type=numbers, metavar="VALUE", help=text
         )
     return parser
+
+
+def _add_engine(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("where it runs", "the result is the same, bit for bit")
+    text = "this process, processes of this machine, or a cluster (default: sequential)"
+    group.add_argument("--backend", choices=sweeps.BACKENDS, default="sequential", help=text)
+    group.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    text = "a running cluster: tcp://host:port of a Dask scheduler, auto or ray://host:port (default: one is started)"
+    group.add_argument("--address", metavar="ADDRESS", help=text)
+    text = "keep finished chunks here: the same command goes on after a kill"
+    group.add_argument("--folder", type=Path, metavar="FOLDER", help=text)
+
+
+def _engine(options: argparse.Namespace) -> sweeps.Engine:
+    show: list[Callable[[int], None]] = []
+
+    def progress(done: int, total: int) -> None:
+        if not show:
+            show.append(_progress(total, "chunks"))
+        show[0](done)
+
+    return sweeps.Engine(
+        backend=options.backend,
+        workers=options.workers,
+        address=options.address,
+        folder=options.folder,
+        progress=progress,
+    )
 
 
 def _add_start(parser: argparse.ArgumentParser) -> None:
@@ -151,10 +200,12 @@ def parser() -> argparse.ArgumentParser:
             "--belt-speed 0:0.6:0.005",
             "--alpha 0.2 0.5 0.7 0.8 --belt-speed 0:0.6:0.005 --geometry cubic --out curve.csv --plot curve.png",
             "--alpha 0.5 --belt-speed 0.4:0.45:0.001 --attractors",
+            "--alpha 0.2:1:0.01 --belt-speed 0:0.6:0.001 --backend loky --folder map --out map.csv",
         ],
     )
     _add_start(command)
     command.add_argument("--attractors", action="store_true", help="all attractors of every point, whatever the start")
+    _add_engine(command)
     _add_output(command, "amplitude over the belt speed")
 
     command = _command(
@@ -194,8 +245,13 @@ def parser() -> argparse.ArgumentParser:
         "basins",
         _basins,
         "which attractor each start of a grid reaches",
-        ["--alpha 0.2 --plot basins.png", "--alpha 0.5 --belt-speed 0.43 --x -1.5 1.5 --v -1 1 --shape 800 800"],
+        [
+            "--alpha 0.2 --plot basins.png",
+            "--alpha 0.5 --belt-speed 0.43 --x -1.5 1.5 --v -1 1 --shape 800 800",
+            "--alpha 0.5 --shape 4000 2500 --backend dask --address tcp://10.0.0.1:8786 --folder basins-alpha-5",
+        ],
     )
+    _add_engine(command)
     command.add_argument("--x", nargs=2, type=float, default=[-1.5, 1.5], metavar=("LOW", "HIGH"), help="starts in x")
     command.add_argument("--v", nargs=2, type=float, default=[-1.0, 1.0], metavar=("LOW", "HIGH"), help="starts in v")
     command.add_argument("--shape", nargs=2, type=int, default=[400, 400], metavar=("N", "M"), help="grid (400 400)")
@@ -274,8 +330,8 @@ def parser() -> argparse.ArgumentParser:
 
 def _grid(options: argparse.Namespace, *, belt_speed: bool = True) -> list[tuple[dict[str, Any], OscillatorParameters]]:
     """Return what was swept, and the parameters, of each point of the grid; all are checked before any is computed."""
-    fields = [name for name in _FIELDS if belt_speed or name != "belt_speed"]
-    values: dict[str, list[Any]] = {"geometry": options.geometry}
+    fields = [name for name in _FIELDS | _LAW_FIELDS if belt_speed or name != "belt_speed"]
+    values: dict[str, list[Any]] = {"geometry": options.geometry, "friction": options.friction}
     for name in fields:
         given = getattr(options, name)
         if given is not None:
@@ -380,21 +436,12 @@ def _amplitude(options: argparse.Namespace) -> int:
     x, v = _start(options)
     if options.attractors and options.start is not None:
         raise UsageError("--start and --attractors exclude each other: all attractors need no start")
-    show = _progress(len(grid) * len(speeds), "points")
-
-    def curves() -> Iterator[dict[str, Any]]:
-        for done, (swept, parameters) in enumerate(grid):
-
-            def progress(rows: int, total: int, before: int = done * len(speeds)) -> None:
-                show(before + rows)
-
-            if options.attractors:
-                curve = attractor_curves(parameters, speeds, progress=progress)
-            else:
-                curve = amplitude_curve(parameters, speeds, x=x, v=v, progress=progress)
-            yield _with_columns(curve, swept)
-
-    table = _stack(curves(), _metadata(options))
+    curves = sweeps.amplitude_sweep(
+        [parameters for _, parameters in grid], speeds, _engine(options), x=x, v=v, all_attractors=options.attractors
+    )
+    table = _stack(
+        (_with_columns(curve, swept) for curve, (swept, _) in zip(curves, grid, strict=True)), _metadata(options)
+    )
     _emit(options, table)
     if options.plot is not None:
         plotting.save_figure(plotting.draw_amplitude_table(table, [swept for swept, _ in grid]), options.plot)
@@ -455,7 +502,12 @@ def _simulate(options: argparse.Namespace) -> int:
 
 def _basins(options: argparse.Namespace) -> int:
     parameters = _one(options)
-    x, v, found = basin_grid(parameters, tuple(options.x), tuple(options.v), tuple(options.shape))
+    x_limits, v_limits, shape = tuple(options.x), tuple(options.v), tuple(options.shape)
+    if options.backend == "sequential" and options.folder is None:
+        _engine(options)  # refuses what does not go with it
+        x, v, found = basin_grid(parameters, x_limits, v_limits, shape)  # on all cores
+    else:
+        x, v, found = sweeps.basin_sweep(parameters, x_limits, v_limits, shape, _engine(options))
     names = [f"{cycle.kind} round x = {0.5 * (cycle.x_max + cycle.x_min):.4f}" for cycle in found.attractors]
     rows: list[dict[str, Any]] = []
     for label, name in [*enumerate(names), (LOST_CONTACT, "contact lost"), (UNDECIDED, "undecided")]:
@@ -601,5 +653,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"sd-friction: cannot write: {error}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt:
-        print("\nsd-friction: interrupted, nothing written", file=sys.stderr)
+        kept = getattr(options, "folder", None)
+        rest = f"the same command goes on with what is in {str(kept)!r}" if kept else "nothing written"
+        print(f"\nsd-friction: interrupted, {rest}", file=sys.stderr)
         return INTERRUPTED

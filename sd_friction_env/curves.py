@@ -143,4 +143,9 @@ def _failed_row(belt_speed: float, x: float, v: float, note: str) -> dict[str, A
 def _table(rows: list[dict[str, Any]], parameters: OscillatorParameters) -> Table:
     names = ["belt_speed", *_CYCLE_COLUMNS, "x_start", "v_start", "note"]
     names += [name for name in rows[0] if name not in names]
-    return Table({name: [row[name] for row in rows] for name in names}, {"parameters": dataclasses.asdict(parameters)})
+    return cycle_table({name: [row[name] for row in rows] for name in names}, parameters)
+
+
+def cycle_table(columns: dict[str, Any], parameters: OscillatorParameters) -> Table:
+    """Return columns of cycles as a table that tells the oscillator."""
+    return Table(columns, {"parameters": dataclasses.asdict(parameters)})

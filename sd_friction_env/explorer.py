@@ -24,7 +24,7 @@ from sd_friction_env.basins import basin_grid
 from sd_friction_env.curves import amplitude_curve
 from sd_friction_env.env import SDFrictionEnv
 from sd_friction_env.orbits import LimitCycle, OrbitError, limit_cycle
-from sd_friction_env.parameters import GEOMETRIES, STATE_LIMIT, OscillatorParameters
+from sd_friction_env.parameters import FRICTIONS, GEOMETRIES, STATE_LIMIT, OscillatorParameters
 from sd_friction_env.plotting import BLACK, BLUE, GREEN, GREY, VERMILION
 from sd_friction_env.policies import ConstantPolicy, Policy, State, VelocityFeedback, ZeroPolicy
 from sd_friction_env.pretrained import load_pretrained
@@ -39,12 +39,26 @@ PLUGINS = "sd_friction_env.controllers"  # group of entry points: functions from
 # Ranges of the sliders (parameters.RANGES allows more): first, last, step.
 SLIDERS: dict[str, tuple[str, float, float, float]] = {
     "belt_speed": ("belt speed v_b", 0.02, 0.6, 0.005),
-    "alpha": ("anchor height alpha", 0.2, 1.2, 0.01),
+    "alpha": ("anchor height alpha", 0.0, 1.2, 0.01),
     "g1": ("weight g1", 0.5, 2.0, 0.05),
     "beta": ("damping beta", 0.0, 0.15, 0.005),
     "mu_s": ("static friction mu_s", 0.05, 0.5, 0.01),
     "mu_m": ("least friction mu_m", 0.0, 0.3, 0.01),
     "v_m": ("speed of least friction v_m", 0.2, 1.0, 0.05),
+}
+# On the second tab: what other laws use, and excitation.
+LAW_SLIDERS: dict[str, tuple[str, float, float, float]] = {
+    "mu_k": ("kinetic friction mu_k (coulomb, exponential)", 0.0, 0.3, 0.01),
+    "delta": ("fall delta (hyperbolic)", 0.0, 10.0, 0.1),
+    "v_0": ("speed of decay v_0 (exponential)", 0.05, 2.0, 0.05),
+    "mu_v": ("viscous part mu_v (exponential)", 0.0, 0.5, 0.01),
+    "kappa": ("stiffening kappa (duffing)", 0.0, 5.0, 0.1),
+    "force_amplitude": ("exciting force", 0.0, 0.5, 0.01),
+    "force_frequency": ("its frequency", 0.1, 5.0, 0.05),
+    "ripple_amplitude": ("ripple on the belt's speed", 0.0, 0.3, 0.01),
+    "ripple_frequency": ("its frequency", 0.1, 5.0, 0.05),
+    "stiffness_amplitude": ("modulation of the stiffness", 0.0, 1.0, 0.02),
+    "stiffness_frequency": ("its frequency", 0.1, 5.0, 0.05),
 }
 _GAIN = 1.5
 _LONGEST = 1_000_000  # steps of an episode: nobody looks on for so long
@@ -210,23 +224,23 @@ class Live:
     # What does not move
 
     def cycle(self) -> LimitCycle | None:
-        """Return the passive limit cycle; None if there is none that can be named."""
+        """Return the passive limit cycle, without excitation; None if there is none that can be named."""
         try:
-            return limit_cycle(self.parameters)
+            return limit_cycle(self.parameters.unexcited)
         except OrbitError:
             return None
 
     def curve(self, speeds: NDArray[np.float64] = _CURVE_SPEEDS) -> dict[str, NDArray[np.float64]]:
-        """Return belt speeds and passive amplitudes, NaN where there is none."""
-        table = amplitude_curve(self.parameters, speeds)
+        """Return belt speeds and passive amplitudes, without excitation, NaN where there is none."""
+        table = amplitude_curve(self.parameters.unexcited, speeds)
         return {"belt_speed": table["belt_speed"], "amplitude": table["amplitude"]}
 
 
 def basin_picture(parameters: OscillatorParameters) -> tuple[NDArray[np.float64], str]:
     """Return where each start of a grid over ``BASIN_VIEW`` ends, shape (80, 120): the number of its attractor, NaN
-    where contact is lost or it is not decided; and in words what there is."""
-    _, _, found = basin_grid(parameters, *BASIN_VIEW, (120, 80))
-    words = []
+    where contact is lost or it is not decided; and in words what there is. Without excitation."""
+    _, _, found = basin_grid(parameters.unexcited, *BASIN_VIEW, (120, 80))
+    words = ["Without excitation:"] if parameters.excited else []
     for i, cycle in enumerate(found.attractors):
         place = 0.5 * (cycle.x_max + cycle.x_min)
         words.append(
@@ -273,6 +287,8 @@ class Page:
             RadioButtonGroup,
             Select,
             Slider,
+            TabPanel,
+            Tabs,
             Toggle,
         )
 
@@ -282,7 +298,9 @@ class Page:
         self.style = InlineStyleSheet(css=_STYLE)
         self.speed = 4  # control intervals a tick
         self.geometry = Select(options=list(GEOMETRIES), value=self.live.parameters.geometry, title="geometry")
-        self.geometry.on_change("value", self._moved("geometry"))
+        self.friction = Select(
+            options=list(FRICTIONS), value=self.live.parameters.friction, title="friction law", name="friction"
+        )
         empty: dict[str, list[float]] = {name: [] for name in ("t", "x", "v", "v_belt", "action", "stick")}
         self.past: dict[str, deque[float]] = {name: deque(maxlen=_HISTORY) for name in empty}
         self.ticks = 0
@@ -304,12 +322,13 @@ class Page:
             name: Slider(
                 title=title, start=low, end=high, step=step, value=getattr(self.live.parameters, name), name=name
             )
-            for name, (title, low, high, step) in SLIDERS.items()
+            for name, (title, low, high, step) in (SLIDERS | LAW_SLIDERS).items()
         }
         self.sliders["belt_speed"].format = "0.000"
-        self.plant_widgets: dict[str, Any] = {**self.sliders, "geometry": self.geometry}
-        for name, slider in self.sliders.items():
-            slider.on_change("value", self._moved(name))
+        self.plant_widgets: dict[str, Any] = {**self.sliders, "geometry": self.geometry, "friction": self.friction}
+        for widget in self.plant_widgets.values():
+            widget.on_change("value", self._moved)
+        self.is_general_warm = False  # the laws beyond the paper's are compiled when first used
         self.several = False  # widgets are being set together
         self.task = RadioButtonGroup(labels=["push the mass (force)", "drive the belt"], active=1, name="task")
         self.task.on_change("active", self._task_changed)
@@ -343,8 +362,17 @@ class Page:
             row(*pushes, width=330),
             row(restart, self.pause, width=330),
             self.readout,
-            *self.sliders.values(),
-            self.geometry,
+            Tabs(
+                tabs=[
+                    TabPanel(
+                        title="plant", child=column(*(self.sliders[name] for name in SLIDERS), self.geometry, width=330)
+                    ),
+                    TabPanel(
+                        title="other friction, excitation",
+                        child=column(self.friction, *(self.sliders[name] for name in LAW_SLIDERS), width=330),
+                    ),
+                ]
+            ),
             row(nominal, basins, width=330),
             width=340,
         )
@@ -427,16 +455,19 @@ class Page:
 
     # What the user does
 
-    def _moved(self, name: str) -> Callable[[str, Any, Any], None]:
-        def moved(attribute: str, old: Any, new: Any) -> None:
-            if self.several:
+    def _moved(self, attribute: str, old: Any, new: Any) -> None:
+        if self.several:
+            return
+        with self._said():
+            # All that the widgets show, for what was refused before may now fit.
+            plant = self.live.parameters.replace(**{name: widget.value for name, widget in self.plant_widgets.items()})
+            if plant.beyond and not self.is_general_warm:
+                self.is_general_warm = True
+                self.message.text = "This law is compiled when first used: it may take half a minute ..."
+                self.document.add_next_tick_callback(lambda: self._moved(attribute, old, new))
                 return
-            with self._said():
-                # All that the widgets show, for what was refused before may now fit.
-                self.live.change(**{name: widget.value for name, widget in self.plant_widgets.items()})
-                self._plant_changed()
-
-        return moved
+            self.live.change(**dataclasses.asdict(plant))
+            self._plant_changed()
 
     @contextlib.contextmanager
     def _said(self) -> Any:
@@ -587,7 +618,7 @@ class Page:
         alpha = self.live.parameters.alpha
         self.anchor.data = {"x": [0.0], "v": [alpha]}
         along = np.linspace(0.0, 1.0, 25)
-        length = np.hypot(x, alpha)
+        length = max(np.hypot(x, alpha), 1e-9)
         wiggle = 0.05 * np.where((along > 0.1) & (along < 0.9), (-1.0) ** np.arange(25), 0.0)
         across = np.array([alpha, x]) / length  # normal to the spring
         self.spring.data = {"x": x * along + across[0] * wiggle, "y": alpha * (1.0 - along) + across[1] * wiggle}

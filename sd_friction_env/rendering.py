@@ -46,7 +46,12 @@ RATES = (1, 1000)
 TRAIL_POINTS = 300
 FADES = 12  # steps in which the trail fades
 CLOSE_UP = 4  # a shape's edges are drawn so many times larger, then averaged
-TITLES = {"exact": "inclined spring", "cubic": "inclined spring, cubic law", "linear": "linear spring"}
+TITLES = {
+    "exact": "inclined spring",
+    "cubic": "inclined spring, cubic law",
+    "linear": "linear spring",
+    "duffing": "stiffening spring",
+}
 MINUS = "\N{MINUS SIGN}"
 NOT_YET = "\N{EN DASH}"
 
@@ -62,7 +67,7 @@ class Scene:
         force: the control force u now. force_limit: its largest size; 0 where the actuator is the belt.
         belt_speed_nominal: belt speed without control. belt_speed_limits: what the actuator can reach; equal where the
             actuator is the force.
-        alpha: height of the spring's anchor. geometry: "linear" draws a level spring from a wall.
+        alpha: height of the spring's anchor. geometry: "linear" and "duffing" draw a level spring from a wall.
         stick_interval: positions between which the mass can stick, if any.
         amplitude: of the last cycle; NaN where not known yet. stick_fraction: share of the time stuck, in [0, 1].
         title: a line above the picture.
@@ -84,6 +89,11 @@ class Scene:
     amplitude: float
     stick_fraction: float
     title: str = ""
+
+    @property
+    def level(self) -> bool:
+        """Whether the spring lies level."""
+        return self.geometry in ("linear", "duffing")
 
 
 class Renderer:
@@ -394,7 +404,7 @@ def _view_of(
     if before is not None:
         x_mechanism, x_plot, v_plot = before.x_mechanism, before.x_plot, before.v_plot
     else:
-        if scene.geometry == "linear" or scene.alpha >= 1.0:  # one well, at x = 0
+        if scene.level or scene.alpha >= 1.0:  # one well, at x = 0
             x_mechanism, x_plot = (-1.0, 1.0), (-0.75, 0.75)
         elif scene.x >= 0.0:  # the well that the mass is in
             x_mechanism, x_plot = (-0.5, 1.5), (0.0, 1.25)
@@ -405,15 +415,15 @@ def _view_of(
     x_plot = x_limits or _grown(x_plot, scene.x, 0.25, 0.05)
     v_plot = v_limits or _grown(_grown(v_plot, scene.v, 0.5 * speed, 0.1 * speed), scene.v_belt, 0.5 * speed, 0.0)
 
-    left = layout.belt.left + (96 if scene.geometry == "linear" else 34) * layout.unit
+    left = layout.belt.left + (96 if scene.level else 34) * layout.unit
     right = layout.belt.right - 34 * layout.unit
     scale = (right - left) / (x_mechanism[1] - x_mechanism[0])
     room = layout.pin - layout.ceiling - 10 * layout.unit
     # A taller anchor makes the picture smaller, but only so far: then its height alone is drawn short.
-    if scene.geometry != "linear" and scene.alpha * scale > room:
+    if not scene.level and scene.alpha * scale > room:
         scale = max(room / scene.alpha, 0.6 * scale)
     origin = (left + right) / 2 - scale * (x_mechanism[0] + x_mechanism[1]) / 2
-    if scene.geometry == "linear":
+    if scene.level:
         anchor = (layout.belt.left + 14 * layout.unit, layout.pin)
         true_height = True
     else:
@@ -717,7 +727,7 @@ def _draw_fixtures(surface: "pygame.Surface", ink: _Lettering, layout: _Layout, 
     band = 9 * u
     _rounded(surface, GROUND, _Box(belt.left + band, belt.top + band, belt.right - band, belt.bottom - band), outer)
 
-    if scene.geometry == "linear":
+    if scene.level:
         x, y = view.anchor
         _hatched_bar(surface, (x, y - 46 * u), (x, belt.top - 3 * u), (-1.0, 0.0), u)
     else:
@@ -789,8 +799,8 @@ def _draw_mechanism(surface: "pygame.Surface", ink: _Lettering, layout: _Layout,
         _draw_streaks(surface, layout, x, scene)
     _draw_mass(surface, layout, x, scene)
     start = view.anchor
-    _spring(surface, start, (x - layout.mass, layout.pin) if scene.geometry == "linear" else pin, u)
-    joints = [start] if scene.geometry == "linear" else [start, pin]
+    _spring(surface, start, (x - layout.mass, layout.pin) if scene.level else pin, u)
+    joints = [start] if scene.level else [start, pin]
     for joint in joints:
         with _CloseUp(surface, joint[0] - 7 * u, joint[1] - 7 * u, joint[0] + 7 * u, joint[1] + 7 * u) as big:
             big.circle(SLATE, joint, 6.5 * u)

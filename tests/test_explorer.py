@@ -177,6 +177,32 @@ def test_a_page_without_a_cycle_shows_no_nan():
     assert "nan" not in page.readout.text
 
 
+def test_another_friction_law_and_excitation_are_shown_and_the_curve_is_of_the_plant_without():
+    page = Page(Document())
+    before = page.curve.data["amplitude"].copy()
+    page.friction.value = "hyperbolic"
+    assert "compiled" in page.message.text  # and on the next tick of the server it is done
+    assert np.array_equal(before, page.curve.data["amplitude"])
+    for callback in page.document.session_callbacks:
+        if not hasattr(callback, "period"):
+            callback.callback()
+    assert page.live.rider.env.parameters.friction == "hyperbolic"
+    plant = OscillatorParameters(friction="hyperbolic")
+    assert np.array_equal(
+        page.curve.data["amplitude"], amplitude_curve(plant, page.curve.data["belt_speed"])["amplitude"], equal_nan=True
+    )
+    page.sliders["force_amplitude"].value = 0.2
+    page.sliders["ripple_amplitude"].value = 0.05
+    assert page.live.rider.env.parameters.excited
+    cycle = page.live.cycle()
+    assert cycle is not None
+    assert cycle.amplitude == limit_cycle(plant).amplitude
+    belts = page.live.advance(40)["v_belt"]
+    assert np.ptp(belts) > 0.05
+    page.tick()
+    assert "Without excitation" in basin_picture(page.live.parameters)[1]
+
+
 def test_a_plugin_that_fails_is_told_and_forgotten(monkeypatch):
     class Failing:
         names = ("broken",)

@@ -4,10 +4,10 @@ Every metric is taken from what the integrator reports of whole control interval
 the belt's speed), never from samples at their ends.
 """
 
-import contextlib
 import functools
 import json
-from collections.abc import Mapping, Sequence
+import operator
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,6 +68,29 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> SDFric
     return env
 
 
+def checked_seeds(seeds: Iterable[Any]) -> list[int]:
+    """Return seeds of episodes as plain integers.
+
+    Raises:
+        TypeError, ValueError: naming the first that is no whole number >= 0, or if there is none.
+    """
+    if isinstance(seeds, str | bytes) or not isinstance(seeds, Iterable):
+        raise TypeError(f"seeds must be whole numbers >= 0 in a sequence, got {seeds!r}")
+    checked = []
+    for seed in seeds:
+        if isinstance(seed, bool | np.bool_):
+            raise TypeError(f"seeds must be whole numbers >= 0, got {seed!r} among them")
+        try:
+            checked.append(operator.index(seed))
+        except TypeError:
+            raise TypeError(f"seeds must be whole numbers >= 0, got {seed!r} among them") from None
+        if checked[-1] < 0:
+            raise ValueError(f"seeds must be whole numbers >= 0, got {seed!r} among them")
+    if not checked:
+        raise ValueError("seeds must be one or more whole numbers >= 0, got none")
+    return checked
+
+
 def run_episodes(
     policy: Policy,
     env_id: str,
@@ -86,9 +109,7 @@ def run_episodes(
         TypeError, ValueError: if there is no seed, one is no such number, an option is not as said, or the policy does
             not fit the environment.
     """
-    seeds = [int(seed) for seed in seeds]
-    if not seeds or min(seeds) < 0:
-        raise ValueError(f"seeds must be one or more whole numbers >= 0, got {seeds!r}")
+    seeds = checked_seeds(seeds)
     make_env(env_id, env_kwargs)  # refuses what is not ours
     n = len(seeds)
     made = gym.make_vec(env_id, n, info_keys=(*_RECORDED, "v_belt"), **dict(env_kwargs or {}))
@@ -237,7 +258,7 @@ def passive_episodes(
         key = json.dumps(dict(env_kwargs or {}), sort_keys=True)
     except TypeError:  # arguments that are no plain data, such as a reward function
         return run_episodes(ZeroPolicy(), env_id, seeds, env_kwargs)
-    return _passive_episodes(env_id, tuple(seeds), key)
+    return _passive_episodes(env_id, tuple(checked_seeds(seeds)), key)
 
 
 @functools.lru_cache(maxsize=8)
@@ -250,20 +271,21 @@ def _passive_episodes(env_id: str, seeds: tuple[int, ...], env_kwargs: str) -> E
 
 def optimal_returns(env_id: str, seeds: Sequence[int], env_kwargs: Mapping[str, Any] | None = None) -> Array | None:
     """Return the best known return from each start, shape (n,), NaN where none is stored; None where none is at all
-    (other arguments, tiers without an optimum, other seeds)."""
+    (other arguments, tiers without an optimum, other seeds).
+
+    Raises:
+        RuntimeError: if the environment has changed since the optimum was computed, or its file is damaged.
+    """
     if env_kwargs:
         return None
     try:
         from agents import optimal
     except ImportError:
         return None
-    known = np.full(len(seeds), np.nan)
-    for i, seed in enumerate(seeds):
-        with contextlib.suppress(FileNotFoundError, ValueError):
-            returns = optimal.optimal_returns(env_id, [int(seed)])
-            if returns is None:
-                return None
-            known[i] = returns[0]
+    stored = optimal.stored_returns(env_id, optimal.OPTIMUM_DIRECTORY)
+    if stored is None:
+        return None
+    known = np.array([stored.get(int(seed), np.nan) for seed in seeds])
     return known if np.isfinite(known).any() else None
 
 

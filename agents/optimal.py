@@ -21,7 +21,6 @@ import dataclasses
 import functools
 import json
 import math
-import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +35,8 @@ import sd_friction_env
 from sd_friction_env import kernel
 from sd_friction_env.env import ACTUATOR_CODES, SDFrictionEnv
 from sd_friction_env.parameters import OscillatorParameters
-from sd_friction_env.policies import PolicyFileError, Readings, State
+from sd_friction_env.policies import PolicyFileError, Readings, State, read_arrays
+from sd_friction_env.pretrained import close
 from sd_friction_env.tables import atomic_file
 from sd_friction_env.task import Task, passive_motion
 
@@ -61,6 +61,10 @@ _UNSEEN = ("sensor", "sensor_noise", "sensor_delay", "observation_limit", "x_off
 
 _DIFFERENCE = 3e-4  # half-width of central differences: the step is exact to about 1e-11
 _STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01, 0.001)
+
+
+class DamagedStudyError(RuntimeError):
+    """A file of a stored optimum is not what it should be."""
 
 
 def _silent(steps: range, label: str) -> Iterable[int]:
@@ -685,7 +689,11 @@ def check_fingerprint(stored: dict[str, Any], env_id: str, seeds: Sequence[int])
     changed = []
     for part, values in now["configuration"].items():
         # An argument that is new since then has a default; whether that changes anything, the golden rollout tells.
-        before = stored["configuration"].get(part, {})
+        configuration = stored.get("configuration")
+        before = configuration.get(part) if isinstance(configuration, dict) else None
+        if not isinstance(before, dict) or not before:
+            changed.append(f"{part}: nothing is stored of it")
+            continue
         names = sorted(name for name in before if before[name] != values.get(name))
         changed += [f"{part} {name}: {before.get(name)!r} -> {values.get(name)!r}" for name in names]
     for part, what in (
@@ -693,15 +701,12 @@ def check_fingerprint(stored: dict[str, Any], env_id: str, seeds: Sequence[int])
         ("draws", "the parameters of the evaluation seeds"),
         ("golden", "the dynamics or the reward"),
     ):
-        before, after = np.array(stored.get(part, [])), np.array(now.get(part, []))
-        if before.shape != after.shape or not np.allclose(before, after, rtol=0.0, atol=GOLDEN_TOLERANCE):
+        if not close(stored.get(part, []), now.get(part, []), GOLDEN_TOLERANCE):
             changed.append(what)
     if changed:
-        task, _, randomised = _FILES[env_id].partition("-")
-        tier = " --tier randomised" if randomised else ""
         raise RuntimeError(
             f"the stored optimum of {env_id} was computed for another environment ({'; '.join(changed)}): "
-            f"recompute it with `python scripts/optimum.py --task {task}{tier}`"
+            f"recompute it with `{_command(env_id)}`"
         )
 
 
@@ -744,13 +749,39 @@ def stored_study(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[str, 
 
     Raises:
         FileNotFoundError: if nothing is stored for the id.
+        DamagedStudyError: if the file is not such a table.
     """
     env_id = _bare_id(env_id)
     if env_id not in _FILES or not _paths(env_id, directory)[0].exists():
         there = [name for name in _FILES if _paths(name, directory)[0].exists()]
         raise FileNotFoundError(f"no optimum is stored for {env_id!r}; stored: {', '.join(there) or 'none'}")
-    content: dict[str, Any] = json.loads(_paths(env_id, directory)[0].read_text(encoding="utf-8"))
+    path = _paths(env_id, directory)[0]
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        of, seeds, returns = content["env_id"], content["seeds"], np.array(content["returns"], dtype=float)
+        if _FILES.get(of) != _FILES[env_id]:
+            raise ValueError(f"it is of {of!r}")
+        if not seeds or returns.shape != (len(seeds),) or any(type(seed) is not int for seed in seeds):
+            raise ValueError("it must hold one return for each of one or more seeds")
+        if not np.isfinite(returns).all():
+            raise ValueError("a return is not finite")
+        if not isinstance(content["fingerprint"], dict):
+            raise ValueError("its fingerprint is none")
+    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise DamagedStudyError(_damaged(path, env_id, error)) from None
     return content
+
+
+def _damaged(path: Path, env_id: str, error: Exception) -> str:
+    return (
+        f"{str(path)!r} does not hold the optimum of {env_id}, or is damaged ({type(error).__name__}: {error}): "
+        f"recompute it with `{_command(env_id)}`"
+    )
+
+
+def _command(env_id: str) -> str:
+    task, _, randomised = _FILES[env_id].partition("-")
+    return f"python scripts/optimum.py --task {task}" + (" --tier randomised" if randomised else "")
 
 
 @functools.lru_cache(maxsize=8)
@@ -758,6 +789,20 @@ def _checked_table(env_id: str, directory: Path) -> dict[int, float]:
     stored = stored_study(env_id, directory)
     check_fingerprint(stored["fingerprint"], env_id, stored["seeds"])
     return dict(zip(stored["seeds"], stored["returns"], strict=True))
+
+
+def stored_returns(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[int, float] | None:
+    """Return the best known returns that are stored for an id, by seed; None if there are none. See
+    :func:`optimal_returns`.
+
+    Raises:
+        RuntimeError: if the environment has changed since they were computed, or (DamagedStudyError) the file cannot be
+            read.
+    """
+    env_id = _bare_id(env_id)
+    if env_id not in _FILES or not _paths(env_id, directory)[0].exists():
+        return None
+    return dict(_checked_table(env_id, directory))
 
 
 def _bare_id(env_id: str) -> str:
@@ -775,12 +820,13 @@ def optimal_returns(
 
     Raises:
         ValueError: if a seed is not among those stored.
-        RuntimeError: if the environment has changed since the reference was computed.
+        RuntimeError: if the environment has changed since the reference was computed, or (DamagedStudyError) its file
+            cannot be read.
     """
     env_id = _bare_id(env_id)
-    if env_id not in _FILES or not _paths(env_id, directory)[0].exists():
+    table = stored_returns(env_id, directory)
+    if table is None:
         return None
-    table = _checked_table(env_id, directory)
     missing = [int(seed) for seed in seeds if int(seed) not in table]
     if missing:
         raise ValueError(
@@ -795,10 +841,19 @@ def optimal_actions(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> tuple[l
 
     Raises:
         FileNotFoundError: if nothing is stored for the id.
+        DamagedStudyError: if a file is not what it should be.
     """
     stored = stored_study(env_id, directory)
-    with np.load(_paths(_bare_id(env_id), directory)[1], allow_pickle=False) as archive:
-        return stored["seeds"], decode(archive["levels"])
+    path = _paths(_bare_id(env_id), directory)[1]
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file of actions {str(path)!r}")
+    try:
+        (levels,) = read_arrays(path, "levels")
+        if levels.ndim != 2 or len(levels) != len(stored["seeds"]) or levels.dtype != np.int16:
+            raise ValueError(f"levels {levels.dtype} {levels.shape} are not those of {len(stored['seeds'])} seeds")
+    except Exception as error:  # see read_arrays
+        raise DamagedStudyError(_damaged(path, _bare_id(env_id), error)) from None
+    return stored["seeds"], decode(levels)
 
 
 # A controller that acts on a value function ---------------------------------------------------------------------------
@@ -847,16 +902,26 @@ class OptimalPolicy:
         path = _value_path(env_id, directory) if env_id in TASKS.values() else None
         if path is None or not path.exists():
             raise FileNotFoundError(f"no value function is stored for {env_id!r}; allowed: {', '.join(TASKS.values())}")
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                stored = json.loads(str(archive["fingerprint"]))
-                lows, highs, values = archive["lows"], archive["highs"], archive["values"]
-        except (KeyError, OSError, ValueError, zipfile.BadZipFile) as error:
-            raise PolicyFileError(f"{str(path)!r} is no value function: {error}") from None
-        check_fingerprint(stored, env_id, [])
         env = _make(env_id)
-        grid = Grid(tuple(lows.tolist()), tuple(highs.tolist()), values.shape)
-        return cls(env.task, env.nominal, Readings.from_env(env), grid, values.ravel().astype(np.float64))
+        try:
+            text, lows, highs, values = read_arrays(path, "fingerprint", "lows", "highs", "values")
+            stored = json.loads(str(text))
+            if not isinstance(stored, dict):
+                raise ValueError("its fingerprint is none")
+            dimensions = 2 + (env.task.actuator == "belt_speed")
+            if not values.ndim == dimensions == lows.size == highs.size or min(values.shape) < 2:
+                raise ValueError(f"values {values.shape} and bounds {lows.shape}, {highs.shape} do not fit")
+            if not (lows < highs).all():
+                raise ValueError(f"bounds {lows.tolist()} to {highs.tolist()} cannot be")
+            grid = Grid(tuple(lows.tolist()), tuple(highs.tolist()), values.shape)
+            policy = cls(env.task, env.nominal, Readings.from_env(env), grid, values.ravel().astype(np.float64))
+        except Exception as error:  # see read_arrays
+            raise PolicyFileError(
+                f"{str(path)!r} is no value function, or is damaged ({type(error).__name__}: {error}): "
+                f"compute it again with `{_command(env_id)} --policy`"
+            ) from None
+        check_fingerprint(stored, env_id, [])
+        return policy
 
     def actions(self, states: Array) -> Array:
         """Return the best actions in states (x, v, v_belt) of shape (n, 3), shape (n,)."""

@@ -216,7 +216,7 @@ def compare(key: Key, agents: Sequence[Agent], effort: Effort, seed: int) -> Com
     notes = []
     try:
         tuned = classical.classical_controllers(env_id)
-    except ValueError:
+    except classical.NotTunedError:
         tuned = {}
         notes.append("No tuned classical controllers are stored, and they are left out")
     baselines = {"passive": ZeroPolicy(), "constant -1": ConstantPolicy(-1.0), "constant +1": ConstantPolicy(1.0)}

@@ -1,6 +1,6 @@
 """Print the numbers the project promises, each beside what it reaches now.
 
-    python scripts/reference_numbers.py              published values, closed forms, energy (seconds)
+    python scripts/reference_numbers.py              published values, closed forms, other laws, energy (seconds)
     python scripts/reference_numbers.py --oracle     and 100 random oscillators against SciPy (about ten minutes)
     python scripts/reference_numbers.py --steps 10000000    and random environment steps, watched for faults
 
@@ -14,7 +14,16 @@ import time
 
 import numpy as np
 
-from sd_friction_env import OscillatorParameters, critical_belt_speeds, equilibria, limit_cycle, simulate
+from sd_friction_env import (
+    OscillatorParameters,
+    attractors,
+    critical_belt_speeds,
+    equilibria,
+    kernel,
+    limit_cycle,
+    simulate,
+    theory,
+)
 
 EXACT = OscillatorParameters()
 CUBIC = EXACT.replace(geometry="cubic")
@@ -105,6 +114,100 @@ def published(report: Report) -> None:
             report.row(f"{name}: v_b1", printed(v_b1)[0], speeds.v_b1, printed(v_b1)[1])
     closed_form = 0.5 * math.sqrt(1.0 - 4.0 * 0.05 * 0.5 / (3.0 * 0.15))
     report.row("linear: v_b1, closed form", closed_form, critical_belt_speeds(LINEAR).v_b1, 1e-12)
+
+
+def linear_belt(report: Report) -> None:
+    """Thomsen and Fidlin's closed forms, first order where the gap allowed says so, and dither."""
+    report.head("The linear belt's closed forms")
+    speeds = critical_belt_speeds(LINEAR)
+    first_order = theory.grazing_belt_speed_first_order(speeds.v_b1)
+    report.row("v_b0, first order (.35% off)", first_order, speeds.v_b0, 0.0036 * first_order)
+    for speed in (0.4, 0.42, 0.43):
+        wanted = float(theory.pure_slip_amplitude(speed, speeds.v_b1))
+        reached = limit_cycle(LINEAR.replace(belt_speed=speed)).amplitude
+        report.row(f"v_b {speed}: pure-slip amplitude A1 (2.5%)", wanted, reached, 0.025 * wanted)
+    for speed in (0.05, 0.1, 0.2, 0.3, 0.35, 0.39):
+        parameters = LINEAR.replace(belt_speed=speed)
+        wanted = float(theory.stick_slip_upper_amplitude(speed, LINEAR.beta, LINEAR.k1, LINEAR.k3))
+        report.row(
+            f"v_b {speed}: upper half-amplitude A+ (.6%)",
+            wanted,
+            limit_cycle(parameters).x_max - equilibria(parameters)[-1].x,
+            0.006 * wanted,
+        )
+    for name, parameters in (("cubic", CUBIC), ("exact", EXACT)):
+        v_b1 = critical_belt_speeds(parameters).v_b1
+        near = parameters.replace(belt_speed=0.99 * v_b1)
+        frequency = abs(equilibria(near)[-1].eigenvalues[0].imag)
+        wanted = float(theory.pure_slip_amplitude(near.belt_speed, v_b1, frequency))
+        report.row(f"{name} .8, .99 v_b1: A1 over frequency (4%)", wanted, limit_cycle(near).amplitude, 0.04 * wanted)
+    limit = theory.no_oscillation_limit(LINEAR.beta, 1.0)
+    for share, wanted in ((0.999, 0.0), (1.001, 1.0)):
+        v_b1 = critical_belt_speeds(LINEAR.replace(mu_m=LINEAR.mu_s - share * limit * LINEAR.v_m)).v_b1
+        report.row(f"oscillates at {share} of 4 beta/(3 N)", wanted, float(v_b1 > 0.0), 0.0)
+    for speed, value in {0.1: "0.27813", 0.2: "0.23985", 0.3: "0.16551", 0.4: "0.05223"}.items():
+        parameters = EXACT.replace(belt_speed=speed)
+        place = equilibria(parameters)[-1]
+        report.row(f"exact .8, v_b {speed}: feedback k", printed(value)[0], 2.0 * place.eigenvalues[0].real,
+                   printed(value)[1])  # fmt: skip
+    for speed in (0.1, 0.2, 0.3, 0.35, 0.4, 0.42):
+        threshold = float(theory.dither_threshold(speed, speeds.v_b1))
+        for share, quenched in ((0.95, 0.0), (1.05, 1.0)):
+            reached = float(share_left(speed, share * threshold) < 0.01)
+            report.row(f"v_b {speed}: dither of {share} of the limit quenches", quenched, reached, 0.0)
+
+
+def share_left(speed: float, dither: float, rate: float = 30.0) -> float:
+    """Return amplitude - f/Omega^2 under a dither of this velocity f/Omega, over the undithered amplitude.
+
+    From 8,000 units of time on: near v_b1 the rest dies out slowly.
+    """
+    calm = limit_cycle(LINEAR.replace(belt_speed=speed)).amplitude
+    plant = LINEAR.replace(force_amplitude=dither * rate, force_frequency=rate).plant
+    x, v, low, high = 0.0, speed, math.inf, -math.inf
+    for t in np.arange(0.0, 8050.0, 10.0).tolist():
+        end = kernel.advance(kernel.later(plant, t), x, v, speed, 0.0, 0.0, 10.0, None)
+        x, v = end[0], end[1]
+        if t >= 8000.0:
+            low, high = min(low, end[10]), max(high, end[11])
+    return float((0.5 * (high - low) - dither / rate) / calm)
+
+
+def other_laws(report: Report) -> None:
+    """Benchmarks of other friction laws and of the discontinuous limit."""
+    report.head("Other laws of friction")
+    coulomb = LINEAR.replace(friction="coulomb", beta=0.0)
+    for speed in (0.05, 0.2, 0.6, 1.5):
+        for static, kinetic in ((0.4, 0.2), (1.0, 0.3)):
+            cycle = limit_cycle(coulomb.replace(mu_s=static, mu_k=kinetic, belt_speed=speed))
+            period = float(theory.coulomb_two_level_period(speed, static - kinetic))
+            size = float(theory.coulomb_two_level_amplitude(speed, static - kinetic))
+            report.row(f"two-level, v_b {speed}, Dl {static - kinetic:.1f}: period", period, cycle.period, 1e-12)
+            report.row(f"two-level, v_b {speed}, Dl {static - kinetic:.1f}: amplitude", size, cycle.amplitude, 1e-12)
+    leine = LINEAR.replace(friction="hyperbolic", beta=0.0, mu_s=1.0, delta=3.0)
+    cycle = limit_cycle(leine)
+    # The reference is right to 5e-12 (Taylor series with 30 digits); the kernel's rule is 1e-10 per unit of time.
+    report.row("Leine: period", 12.001031294826, cycle.period, 1e-9)
+    report.row("Leine: x_max", 1.133944676443, cycle.x_max, 1e-9)
+    decay = coulomb.replace(mu_s=1.0, mu_k=1.0, belt_speed=0.0)
+    end = kernel.advance(decay.plant, 12.0, 6.0, 0.0, 0.0, 0.0, 60.0, None)
+    report.row("Coulomb decay from (12, 6): rest, 8 digits", 0.68217894, end[0], 5.1e-9)
+    report.row("Coulomb decay from (12, 6): rest, closed form", theory.coulomb_rest_x(12.0, 6.0), end[0], 1e-10)
+    exponential = LINEAR.replace(friction="exponential", mu_s=1.0, mu_k=0.5, v_0=0.5)
+    speeds = critical_belt_speeds(exponential)
+    report.row("exponential: Hopf, .5 ln 10", 0.5 * math.log(10.0), speeds.v_b1, 1e-9)
+    report.row("exponential: the cycle disappears", *printed("1.8366")[:1], speeds.v_b0, 1e-4)
+    kinds = {found.kind for found in attractors(exponential.replace(belt_speed=1.5))}
+    report.row("exponential, v_b 1.5: attractors", 2.0, float(len(kinds)), 0.0)
+
+    report.head("alpha = 0: a well is the linear belt, and small alpha tends to it in first order")
+    zero = EXACT.replace(alpha=0.0)
+    cycle, level = limit_cycle(zero, 1.0), limit_cycle(LINEAR)
+    report.row("alpha 0: amplitude", level.amplitude, cycle.amplitude, 1e-12)
+    report.row("alpha 0: period", level.period, cycle.period, 1e-12)
+    report.row("alpha 0: v_b1", critical_belt_speeds(LINEAR).v_b1, critical_belt_speeds(zero).v_b1, 1e-10)
+    gaps = [limit_cycle(EXACT.replace(alpha=a), 1.0).amplitude - cycle.amplitude for a in (2e-3, 1e-3)]
+    report.row("amplitude's gap at alpha .002 over that at .001", 2.0, gaps[0] / gaps[1], 0.02)
 
 
 def energy(report: Report) -> None:
@@ -214,6 +317,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     report = Report()
     published(report)
+    linear_belt(report)
+    other_laws(report)
     energy(report)
     if options.oracle:
         against_oracle(report, options.draws)

@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f'a report needs {" and ".join(missing)}: pip install "sd-friction-env[report]"')
     from tqdm import tqdm
 
-    from agents import report, runs
+    from agents import classical, report, runs
 
     begun = time.perf_counter()
     agents: list[report.Agent] = []
@@ -74,7 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if options.agents is not None or AGENTS.is_dir():
             agents, notes = report.find_agents(options.agents or AGENTS)
-    except runs.RunFolderError as error:
+        classical.stored_gains()  # a damaged file is told before anything is computed
+    except (runs.RunFolderError, ValueError) as error:
         parser.error(" ".join(str(error).split()))
     keys = [(task, tier) for task in TASKS if task in options.task for tier in TIERS if tier in options.tier]
     agents = [agent for agent in agents if (agent.task, agent.tier) in keys]

@@ -4,8 +4,8 @@
     python scripts/tune_classical.py --task belt --tier nominal   those of one environment
     python scripts/tune_classical.py --task force --controller LQR "sliding mode" --generations 60
 
-SciPy's differential evolution maximises the mean return. What is finished is kept at once; Ctrl-C loses what is
-running.
+SciPy's differential evolution maximises the mean return. What is finished is kept at once, unless what is stored does
+better; Ctrl-C loses what is running. Several of these may run side by side.
 """
 
 import argparse
@@ -66,12 +66,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     population=options.population,
                     progress=show,
                 )
-            gains = classical.stored_gains()  # as it is now: another process may have tuned other ones meanwhile
-            gains.setdefault(env_id, {})[name] = {**found, "command": command}
-            classical.store(gains)
+            kept = classical.keep(env_id, name, {**found, "command": command})
             came_to = f"return {found['validation_return']:8.2f}, suppressed {found['suppressed']:4.0%}"
             values = ", ".join(f"{key} {value:.4g}" for key, value in found["values"].items())
             print(f"{env_id:36} {name:38} {came_to}, {values}", flush=True)
+            if kept["values"] != found["values"]:
+                print(f"  not kept: what is stored comes to {kept['validation_return']:.2f}", flush=True)
+            for value, what in kept["at_bound"].items():
+                print(f"  {value} is at its bound: {what or 'a wider one may find better'}", flush=True)
     except KeyboardInterrupt:
         print("\ntune_classical.py: interrupted; what was finished is kept", file=sys.stderr)
         return 130

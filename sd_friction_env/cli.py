@@ -22,6 +22,7 @@ from sd_friction_env import plotting, sweeps
 from sd_friction_env.basins import LOST_CONTACT, UNDECIDED, basin_grid
 from sd_friction_env.curves import checked_belt_speeds
 from sd_friction_env.doctor import as_text, examine, hyperparameter_folder
+from sd_friction_env.forced import lyapunov_exponent, poincare_section
 from sd_friction_env.orbits import OrbitError, critical_belt_speeds, first_lyapunov_coefficient, limit_cycle
 from sd_friction_env.parameters import FRICTIONS, GEOMETRIES, RANGES, OscillatorParameters
 from sd_friction_env.policies import Policy, VelocityFeedback, ZeroPolicy, load_policy
@@ -256,6 +257,48 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--v", nargs=2, type=float, default=[-1.0, 1.0], metavar=("LOW", "HIGH"), help="starts in v")
     command.add_argument("--shape", nargs=2, type=int, default=[400, 400], metavar=("N", "M"), help="grid (400 400)")
     _add_output(command, "the basins")
+
+    forced = "--force-amplitude 0.2 --force-frequency 1.3"
+    command = _command(
+        commands,
+        "poincare",
+        _poincare,
+        "the state once per drive period of a forced motion",
+        [f"{forced} --cycles 2000 --out section.csv --plot section.png"],
+    )
+    _add_start(command)
+    command.add_argument("--cycles", type=int, default=1000, help="drive periods told of (default: 1000)")
+    command.add_argument("--transient", type=int, default=200, help="drive periods before (default: 200)")
+    _add_output(command, "the section")
+
+    command = _command(
+        commands,
+        "lyapunov",
+        _lyapunov,
+        "Lyapunov exponents: is a motion chaotic?",
+        [forced, "--force-amplitude 0.05:0.3:0.01 --force-frequency 1.3 --out exponents.csv", "--belt-speed 0.42"],
+    )
+    _add_start(command)
+    command.add_argument("--cycles", type=int, default=2000, help="drive periods averaged over (default: 2000)")
+    command.add_argument("--transient", type=int, default=200, help="drive periods before (default: 200)")
+    _add_output(command, None)
+
+    command = _command(
+        commands,
+        "bifurcation",
+        _bifurcation,
+        "stroboscopic sections of a forced motion over a parameter, up and down",
+        ["--force-frequency 1.3 --over force-amplitude 0.01:0.3:0.002 --backend loky --plot diagram.png"],
+    )
+    command.add_argument(
+        "--over", nargs="+", required=True, metavar=("NAME", "VALUE"), help="the parameter, and its values or ranges"
+    )
+    command.add_argument("--direction", choices=("up", "down", "both"), default="both", help="(default: both)")
+    command.add_argument("--cycles", type=int, default=60, help="drive periods told of (default: 60)")
+    command.add_argument("--transient", type=int, default=200, help="drive periods before (default: 200)")
+    command.add_argument("--exponents", action="store_true", help="the largest Lyapunov exponent of each as well")
+    _add_engine(command)
+    _add_output(command, "the diagram")
 
     command = _bare_command(
         commands,
@@ -518,6 +561,64 @@ def _basins(options: argparse.Namespace) -> int:
     if options.plot is not None:
         figure, axes = plotting.new_figure(6.8, 4.8, 1, 1)
         plotting.draw_basins(axes[0, 0], x, v, found)
+        plotting.save_figure(figure, options.plot)
+    return 0
+
+
+def _poincare(options: argparse.Namespace) -> int:
+    x, v = _start(options)
+    section = poincare_section(_one(options), x, v, cycles=options.cycles, transient=options.transient)
+    section.metadata = _metadata(options)
+    _emit(options, section)
+    if options.plot is not None:
+        figure, axes = plotting.new_figure(5.4, 4.6, 1, 1)
+        plotting.draw_section(axes[0, 0], section)
+        plotting.save_figure(figure, options.plot)
+    return 0
+
+
+def _lyapunov(options: argparse.Namespace) -> int:
+    grid = _grid(options)
+    x, v = _start(options)
+    show = _progress(len(grid), "motions")
+    rows = []
+    for done, (swept, parameters) in enumerate(grid, start=1):
+        found = lyapunov_exponent(parameters, x, v, cycles=options.cycles, transient=options.transient)
+        told = {"largest": found.largest, "standard_error": found.standard_error}
+        exponents = {"first": found.exponents[0], "second": found.exponents[1]}
+        rows.append(swept | told | exponents | {"singular_events": found.singular_events, "cycles": found.cycles})
+        show(done)
+    _emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, _metadata(options)))
+    return 0
+
+
+def _bifurcation(options: argparse.Namespace) -> int:
+    name, *texts = options.over
+    name = name.replace("-", "_")
+    try:
+        values = list(itertools.chain.from_iterable(numbers(text) for text in texts))
+    except argparse.ArgumentTypeError as error:
+        raise UsageError(f"--over {options.over[0]}: {error}") from None
+    grid = _grid(options)
+    if name in grid[0][0]:
+        raise UsageError(f"--over and --{options.over[0]} are one parameter: give it once")
+    tables = sweeps.bifurcation_sweep(
+        [parameters for _, parameters in grid],
+        name,
+        values,
+        _engine(options),
+        direction=options.direction,
+        cycles=options.cycles,
+        transient=options.transient,
+        lyapunov=options.exponents,
+    )
+    table = _stack(
+        (_with_columns(part, swept) for part, (swept, _) in zip(tables, grid, strict=True)), _metadata(options)
+    )
+    _emit(options, table)
+    if options.plot is not None:
+        figure, axes = plotting.new_figure(7.0, 4.4, 1, 1)
+        plotting.draw_bifurcation(axes[0, 0], tables[0])
         plotting.save_figure(figure, options.plot)
     return 0
 

@@ -59,6 +59,7 @@ NOTHING_KNOWN = (0.0,) * 18  # of a slip that begins
 V_REL_ZERO = 1e-14  # relative velocities this small cannot be told from zero after one step's rounding
 TIME_ZERO = 1e-13  # events are located this closely in time
 HUGE_EXPONENT = 700.0  # a trial step across the surface may ask for more, and is refused anyway
+PHASE_ROUNDING = 1e-15  # of a phase, relative to itself
 ROUNDING = 1e-14  # of a sum of forces, relative to the greatest of them
 SIDE_ZERO = 1e-14  # x this small is on neither side of zero
 LAST_STRETCH = 1e-5  # of a step: a Taylor step of this length is exact to rounding
@@ -220,7 +221,9 @@ def _into_frame(laws, x, v, v_belt):
         return x, v
     way, speed, _, _ = _ripple(laws)
     v = v - speed
-    return x - way, v_belt if abs(v - v_belt) <= V_REL_ZERO else v
+    # Where a state was left, its time was rounded otherwise, and so was the ripple's phase.
+    zero = V_REL_ZERO + PHASE_ROUNDING * laws.ripple * (laws.ripple_rate * laws.time + abs(laws.ripple_phase))
+    return x - way, v_belt if abs(v - v_belt) <= zero else v
 
 
 @compiled
@@ -885,6 +888,41 @@ def _contact_loss_time(plant, mode, x, v, v_belt, a_belt, u, high):
 
 
 @compiled
+def _normal_rate(plant, laws, x, v):
+    """Return the rate of change of the normal force."""
+    place = room_x(plant, x)
+    return spring_slopes(plant, place)[1] * room_v(plant, v) + _aging(plant, laws, place)[2]
+
+
+@compiled
+def _thin_contact(plant, laws, mode, x, v, v_belt, a_belt, u, x_end, v_end, h):
+    """Whether a modulated stiffness lets the normal force dip to zero within a step at whose ends it is above, and the
+    time by which contact is lost if so, else h."""
+    if laws is None:
+        return False, h
+    if laws.depth == 0.0:
+        return False, h
+    if not (
+        _normal_rate(plant, laws, x, v) < 0.0
+        and _normal_rate(later(plant, h), later(plant, h).laws, x_end, v_end) > 0.0
+    ):
+        return False, h
+    low = 0.0
+    high = h
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        x_t, v_t, _, _, _, _, _ = slip_step(plant, mode, x, v, v_belt, a_belt * middle, u, middle)
+        then = later(plant, middle)
+        if spring(then, room_x(then, x_t))[1] <= 0.0:
+            return True, middle
+        if _normal_rate(then, then.laws, x_t, v_t) < 0.0:
+            low = middle
+        else:
+            high = middle
+    return False, h
+
+
+@compiled
 def _switching(plant, laws, mode, x, v, v_belt, a_belt, u, x_end, v_end, h):
     """Look for the first time in a step of length h at which x falls through zero, where the field is frozen to one
     side of it: whether there is one, the time, v, and the integrals of v^2 and of the contact force's power."""
@@ -959,6 +997,9 @@ def _rounding(plant, laws, mode, x, v, v_belt):
     """Return an error per unit of time below which rounding hides the estimate: of large forces in balance."""
     if laws is None:
         return 0.0
+    calm_plant = laws.force == 0.0 and laws.ripple == 0.0 and laws.depth == 0.0
+    if calm_plant and laws.friction == STRIBECK and plant.geometry <= LINEAR:
+        return 0.0  # as without laws
     place = room_x(plant, x)
     restoring, normal = spring(plant, place)
     forces = abs(restoring) + abs(friction_coefficient(plant, mode, v - v_belt) * normal)
@@ -990,8 +1031,9 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
     greatest x met. After LANDING v equals the belt speed exactly, after TURNING it is exactly zero.
     """
     plant = _faced_in_slip(plant, plant.laws, mode, x, v, v_belt, u)
+    longest = _short_of_excitation(plant.laws, 1.0, MAX_SLIP_STEP)
     t = 0.0
-    h = min(duration, MAX_SLIP_STEP)
+    h = min(duration, longest)
     x_min = room_x(plant, x)
     x_max = x_min
     int_v2 = 0.0
@@ -1081,10 +1123,11 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
                 length, x_end, v_end, dv2, dfv = t_turn, x_turn, _frame_v(then.laws, 0.0), dv2_turn, dfv_turn
                 event = TURNING
 
-        # N falls with |x|: it is least at a turning point or at the end of the step.
+        # N falls with |x|: it is least at a turning point or at the end of the step, unless the stiffness is modulated.
         end = later(now, length)
-        if spring(end, room_x(end, x_end))[1] <= 0.0:
-            length = _contact_loss_time(now, mode, x, v, belt, a_belt, u, length)
+        thin, t_thin = _thin_contact(now, now.laws, mode, x, v, belt, a_belt, u, x_end, v_end, length)
+        if thin or spring(end, room_x(end, x_end))[1] <= 0.0:
+            length = _contact_loss_time(now, mode, x, v, belt, a_belt, u, t_thin)
             x_end, v_end, a, a_end, error, dv2, dfv = slip_step(now, mode, x, v, belt, a_belt * length, u, length)
             event = CONTACT_LOSS
 
@@ -1099,7 +1142,7 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
         if event != NO_EVENT:
             break
         if error < max(STEP_DOUBLING * allowed, noise):
-            h = min(2.0 * h, MAX_SLIP_STEP)
+            h = min(2.0 * h, longest)
     if event == NO_EVENT:
         belt = v_belt + a_belt * duration
         if mode * (v - belt) <= V_REL_ZERO:
@@ -1198,7 +1241,7 @@ def stick_until_event(plant, x, v_belt, a_belt, u, duration):
     piece = duration
     if fastest > 0.0:
         piece = min(duration, 0.125 * scale / fastest)
-    piece = _short_of_excitation(plant.laws, piece)
+    piece = _short_of_excitation(plant.laws, 0.125, piece)
     t = 0.0
     while t < duration:
         t_end = t + piece
@@ -1234,7 +1277,8 @@ def stick_until_event(plant, x, v_belt, a_belt, u, duration):
 
 
 @compiled
-def _short_of_excitation(laws, piece):
+def _short_of_excitation(laws, angle, piece):
+    """Return a length of time, or less: that in which the fastest excitation goes through this angle."""
     if laws is None:
         return piece
     fastest = 0.0
@@ -1244,7 +1288,7 @@ def _short_of_excitation(laws, piece):
         fastest = max(fastest, laws.ripple_rate)
     if laws.depth != 0.0:
         fastest = max(fastest, laws.depth_rate)
-    return min(piece, 0.125 / fastest) if fastest > 0.0 else piece
+    return min(piece, angle / fastest) if fastest > 0.0 else piece
 
 
 @compiled
@@ -1257,6 +1301,16 @@ def _switches_in_stick(plant, laws, x, v_belt, a_belt, t, t_end):
     side = laws.side
     low = t
     high = t_end
+    falls = side * room_v(later(plant, low), v_belt + a_belt * low) < 0.0
+    rises = side * room_v(later(plant, high), v_belt + a_belt * high) > 0.0
+    if falls and rises:  # the belt turns in between: as deep as there it comes nowhere
+        first = low
+        for _ in range(60):
+            middle = 0.5 * (first + high)
+            if side * room_v(later(plant, middle), v_belt + a_belt * middle) < 0.0:
+                first = middle
+            else:
+                high = middle
     if side * room_x(later(plant, high), x + (v_belt + 0.5 * a_belt * high) * high) > -SIDE_ZERO:
         return False, t_end
     for _ in range(200):
@@ -1332,7 +1386,7 @@ def _excited_ride(plant, laws, x, v_belt, a_belt, u, duration, int_v2, int_fv, x
         return int_v2, int_fv, x_min, x_max
     if laws.force == 0.0 and laws.ripple == 0.0 and laws.depth == 0.0:
         return int_v2, int_fv, x_min, x_max
-    pieces = int(duration / _short_of_excitation(laws, 0.5)) + 1
+    pieces = int(duration / _short_of_excitation(laws, 0.125, 0.5)) + 1
     length = duration / pieces
     int_v2 = 0.0
     int_fv = 0.0
@@ -1346,14 +1400,15 @@ def _excited_ride(plant, laws, x, v_belt, a_belt, u, duration, int_v2, int_fv, x
     before = 0.0
     w_before = room_v(plant, v_belt)
     for piece in range(pieces):
-        for j in range(5):
-            t = (piece + _NODES[j]) * length
+        for j in range(6):  # the sixth is the piece's end
+            t = (piece + _NODES[j]) * length if j < 5 else (piece + 1) * length
             then = later(faced_plant, t)
             speed = v_belt + a_belt * t
             w = room_v(then, speed)
-            load, _ = stick_load(then, x + (v_belt + 0.5 * a_belt * t) * t, speed, a_belt, u)
-            int_v2 += _WEIGHTS[j] * length * (w * w)
-            int_fv += _WEIGHTS[j] * length * (load * w)
+            if j < 5:
+                load, _ = stick_load(then, x + (v_belt + 0.5 * a_belt * t) * t, speed, a_belt, u)
+                int_v2 += _WEIGHTS[j] * length * (w * w)
+                int_fv += _WEIGHTS[j] * length * (load * w)
             if w * w_before < 0.0:
                 low = before
                 high = t
@@ -3407,3 +3462,318 @@ def contact(state, integers, which, modes, v_belts, v_rels, normal_forces, beyon
         modes[j], v_belts[j], v_rels[j], normal_forces[j] = left_alone(
             plant, state[S_X, i], state[S_V, i], state[S_BELT, i]
         )
+
+
+# Forced dynamics ----------------------------------------------------------------------------------------------------
+#
+# Motions of a steady belt under excitation alone, their stroboscopic maps and their tangent flow. `advance` follows the
+# motion and lists its events; the legs between them are gone through again for the tangents, so that the automaton
+# stands in one place. Tangents (dx, dv) compare states at one time, so that the ripple's frame and the room have the
+# same ones.
+
+TANGENT_STEP = 0.1  # of the shortest time in which the linearised motion changes
+TANGENT_BEND = 1e-4  # by so much a step's coefficients may depart from straight lines, times its length
+TANGENT_SMALLEST_STEP = 1e-9
+MOST_CALLS = 256  # of advance in one walk, each of MAX_EVENTS events
+
+# What `stroboscope` writes of a cycle.
+(R_X, R_V, R_MODE, R_STICK_TIME, R_STICKS, R_FORWARD_ARCS, R_X_MIN, R_X_MAX), CYCLE_ROW = range(8), 8
+
+
+@compiled
+def _linearised(plant, mode, x, v, v_belt):
+    """Return the stiffness and the damping of small deviations in slip: dv' = -stiffness dx - damping dv."""
+    place = room_x(plant, x)
+    v_rel = v - v_belt
+    restoring_slope, normal_slope = spring_slopes(plant, place)
+    stiffness = restoring_slope + friction_coefficient(plant, mode, v_rel) * normal_slope
+    return stiffness, 2.0 * plant.beta + spring(plant, place)[1] * friction_slope(plant, mode, v_rel)
+
+
+@compiled
+def _tangent_step(h, k_0, c_0, k_1, c_1, k_2, c_2, dx, dv):
+    """Take a classical Runge-Kutta step of a deviation; stiffness and damping are given at 0, h/2 and h."""
+    p1, q1 = dv, -k_0 * dx - c_0 * dv
+    p2 = dv + 0.5 * h * q1
+    q2 = -k_1 * (dx + 0.5 * h * p1) - c_1 * p2
+    p3 = dv + 0.5 * h * q2
+    q3 = -k_1 * (dx + 0.5 * h * p2) - c_1 * p3
+    p4 = dv + h * q3
+    q4 = -k_2 * (dx + h * p3) - c_2 * p4
+    return dx + h / 6.0 * (p1 + 2.0 * p2 + 2.0 * p3 + p4), dv + h / 6.0 * (q1 + 2.0 * q2 + 2.0 * q3 + q4)
+
+
+@compiled
+def _carry_in_slip(plant, mode, x, v, v_belt, duration, vectors):
+    """Carry tangents (n, 2) along a slip of this length, in which nothing happens."""
+    plant = _faced_in_slip(plant, plant.laws, mode, x, v, v_belt, 0.0)
+    t = 0.0
+    h = duration
+    while t < duration:
+        remaining = duration - t
+        now = later(plant, t)
+        k_0, c_0 = _linearised(now, mode, x, v, v_belt)
+        h = min(h, remaining, TANGENT_STEP / max(1.0, math.sqrt(abs(k_0)), abs(c_0)))
+        x_1, v_1, _, _, _, _, _ = slip_step(now, mode, x, v, v_belt, 0.0, 0.0, 0.5 * h)
+        middle = later(now, 0.5 * h)
+        k_1, c_1 = _linearised(middle, mode, x_1, v_1, v_belt)
+        x_2, v_2, _, _, _, _, _ = slip_step(middle, mode, x_1, v_1, v_belt, 0.0, 0.0, 0.5 * h)
+        k_2, c_2 = _linearised(later(now, h), mode, x_2, v_2, v_belt)
+        bend = h * (abs(k_0 - 2.0 * k_1 + k_2) + abs(c_0 - 2.0 * c_1 + c_2))
+        if not bend <= TANGENT_BEND and h > TANGENT_SMALLEST_STEP:
+            h = 0.5 * h
+            continue
+        for i in range(len(vectors)):
+            vectors[i, 0], vectors[i, 1] = _tangent_step(h, k_0, c_0, k_1, c_1, k_2, c_2, vectors[i, 0], vectors[i, 1])
+        x = x_2
+        v = v_2
+        t = duration if h == remaining else t + h
+        if bend < 0.1 * TANGENT_BEND:
+            h = 2.0 * h
+
+
+@compiled
+def _mode_after(plant, mode, kind, x, v_belt):
+    """Return the mode in which an event at x leaves a mass."""
+    if kind == RESTICK:
+        return STICK
+    if kind == CROSSING:
+        return -mode
+    if kind == BREAKAWAY:
+        return _breakaway_mode(plant, x, v_belt, 0.0, 0.0)
+    if kind == SWITCHING and mode == STICK:
+        return mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
+    return mode
+
+
+@compiled
+def _acceleration(plant, mode, x, v, v_belt):
+    """Return the acceleration in any mode of a mass that has just entered it."""
+    if mode == STICK:
+        return 0.0
+    plant = _faced_in_slip(plant, plant.laws, mode, x, v, v_belt, 0.0)
+    return slip_forces(plant, mode, x, v, v_belt, 0.0)[0]
+
+
+@compiled
+def _acceleration_before_switch(plant, laws, mode, x, v, v_belt):
+    if laws is None:
+        return 0.0
+    if mode == STICK:
+        return 0.0
+    before = _with_laws(plant, laws, -1.0 if room_v(plant, v) > 0.0 else 1.0, laws.time)
+    return slip_forces(before, mode, x, v, v_belt, 0.0)[0]
+
+
+@compiled
+def saltation(plant, mode, after, kind, x, v, v_belt):
+    """Return what an event does to tangents, dv+ = of_x dx + of_v dv (dx stays, for v is continuous): of_x, of_v, and
+    whether the derivative does not exist there (the event is touched, not passed).
+
+    With f = (v, a) before and after and the event at h(x, v, t) = 0 it is 1 + (f+ - f-) grad h / (dh/dt along f-);
+    Leine and Nijmeijer: Dynamics and Bifurcations of Non-Smooth Mechanical Systems (2004), ch. 7.
+    """
+    if kind == RESTICK:
+        return 0.0, 0.0, False
+    if kind == CROSSING:
+        a = _acceleration(plant, mode, x, v, v_belt)
+        if a == 0.0:
+            return 0.0, 1.0, True
+        return 0.0, _acceleration(plant, after, x, v, v_belt) / a, False
+    if kind == BREAKAWAY:
+        side = -after
+        _, slope = _cone_excess(plant, side, x, v_belt, 0.0, 0.0, 0.0)
+        if not slope > 0.0:
+            return 0.0, 0.0, True
+        restoring_slope, normal_slope = spring_slopes(plant, room_x(plant, x))
+        of_x = (side * restoring_slope - plant.mu_s * normal_slope) / slope
+        return of_x * _acceleration(plant, after, x, v, v_belt), 0.0, False
+    if kind == SWITCHING:
+        w = room_v(plant, v)
+        if w == 0.0:
+            return 0.0, 1.0, True
+        jump = _acceleration(plant, after, x, v, v_belt)
+        jump = jump - _acceleration_before_switch(plant, plant.laws, mode, x, v, v_belt)
+        return jump / w, 1.0, False
+    return 0.0, 1.0, kind == GRAZING
+
+
+@compiled
+def walk(plant, x, v, v_belt, duration, events, vectors):
+    """Follow a motion under excitation alone and carry tangents (n, 2) along it, if there are any.
+
+    ``events`` (MAX_EVENTS, 4) is scratch space. Return x, v, the mode, the status, the time reached, the time stuck,
+    the sticks and the forward-slip arcs that began, the least and greatest x, whether it ever stuck (the tangents then
+    have one direction left) and the number of events without a derivative.
+    """
+    t = 0.0
+    stick_time = 0.0
+    sticks = 0
+    forward_arcs = 0
+    singular = 0
+    x_min = x
+    x_max = x
+    ever_stuck = False
+    mode = STICK
+    status = EVENT_LIMIT
+    for _ in range(MOST_CALLS):
+        now = later(plant, t)
+        x_end, v_end, _, mode_end, status, dt, n_events, _, stuck, _, low, high = advance(
+            now, x, v, v_belt, 0.0, 0.0, duration - t, events
+        )
+        x_leg, v_leg = _into_frame(now.laws, x, v, v_belt)
+        mode = _mode_of(now, x_leg, v_leg, v_belt, 0.0, 0.0)
+        begin = 0.0
+        for n in range(n_events + 1):
+            end = events[n, 0] if n < n_events else dt
+            if mode == STICK:
+                ever_stuck = True
+                for i in range(len(vectors)):
+                    vectors[i, 1] = 0.0
+            elif len(vectors) > 0:
+                _carry_in_slip(later(now, begin), mode, x_leg, v_leg, v_belt, end - begin, vectors)
+            if n == n_events:
+                break
+            then = later(now, end)
+            kind = int(events[n, 1])
+            x_leg, v_leg = _into_frame(then.laws, events[n, 2], events[n, 3], v_belt)
+            after = _mode_after(then, mode, kind, x_leg, v_belt)
+            of_x, of_v, touched = saltation(then, mode, after, kind, x_leg, v_leg, v_belt)
+            singular += 1 if touched else 0
+            for i in range(len(vectors)):
+                vectors[i, 1] = of_x * vectors[i, 0] + of_v * vectors[i, 1]
+            sticks += 1 if kind == RESTICK else 0
+            forward_arcs += 1 if after == SLIP_FORWARD and mode != SLIP_FORWARD else 0
+            mode = after
+            begin = end
+        x = x_end
+        v = v_end
+        mode = mode_end
+        stick_time += stuck
+        x_min = min(x_min, low)
+        x_max = max(x_max, high)
+        t = duration if status == OK else t + dt
+        if status != EVENT_LIMIT:
+            break
+    return x, v, mode, status, t, stick_time, sticks, forward_arcs, x_min, x_max, ever_stuck, singular
+
+
+@compiled
+def _renormalise(vectors, stuck):
+    """Make two tangents orthonormal; return the logarithms of the length and of the height that they had."""
+    dx, dv = vectors[0, 0], vectors[0, 1]
+    size = math.sqrt(dx * dx + dv * dv)
+    if not size > 0.0:
+        vectors[0, 0], vectors[0, 1], vectors[1, 0], vectors[1, 1] = 1.0, 0.0, 0.0, 1.0
+        return -math.inf, -math.inf
+    dx = dx / size
+    dv = dv / size
+    height = abs(dx * vectors[1, 1] - dv * vectors[1, 0])
+    vectors[0, 0], vectors[0, 1], vectors[1, 0], vectors[1, 1] = dx, dv, -dv, dx
+    return math.log(size), math.log(height) if height > 0.0 and not stuck else -math.inf
+
+
+@compiled
+def stroboscope(plant, x, v, v_belt, period, skipped, rows, growth):
+    """Follow a motion over ``skipped`` cycles of the excitation, then over as many as ``rows`` (n, CYCLE_ROW) has,
+    written down one each: the state and the mode at its end, and the time stuck, the sticks and the forward-slip arcs
+    that began, and the least and greatest x in it.
+
+    ``growth`` (n, 2) takes the logarithms by which two tangents, made orthonormal after each cycle, grow; without rows
+    there are no tangents.
+    Return x, v, the status, how many rows were written and the number of events without a derivative.
+    """
+    events = np.empty((MAX_EVENTS, 4))
+    vectors = np.zeros((2 if len(growth) > 0 else 0, 2))
+    for i in range(len(vectors)):
+        vectors[i, i] = 1.0
+    singular = 0
+    status = OK
+    for n in range(skipped + len(rows)):
+        now = later(plant, n * period)
+        x, v, mode, status, _, stick_time, sticks, forward_arcs, x_min, x_max, stuck, touched = walk(
+            now, x, v, v_belt, period, events, vectors
+        )
+        if status != OK:
+            return x, v, status, max(n - skipped, 0), singular
+        first, second = 0.0, 0.0
+        if len(vectors) > 0:
+            first, second = _renormalise(vectors, stuck)
+        i = n - skipped
+        if i < 0:
+            continue
+        singular += touched
+        rows[i, R_X] = x
+        rows[i, R_V] = v
+        rows[i, R_MODE] = mode
+        rows[i, R_STICK_TIME] = stick_time
+        rows[i, R_STICKS] = sticks
+        rows[i, R_FORWARD_ARCS] = forward_arcs
+        rows[i, R_X_MIN] = x_min
+        rows[i, R_X_MAX] = x_max
+        if len(growth) > 0:
+            growth[i, 0] = first
+            growth[i, 1] = second
+    return x, v, status, len(rows), singular
+
+
+@compiled
+def reach(plant, xs, vs, v_belt, period, cycles, points, point_labels, tolerance, labels):
+    """Follow each start (xs, vs) of shape (n,) until, at the end of a cycle, it is within ``tolerance`` of one of the
+    ``points`` (m, 2), and write the label of that, -1 if it lost contact and -2 if ``cycles`` did not do. The starts
+    are moved to where they were followed to."""
+    events = np.empty((MAX_EVENTS, 4))
+    none = np.empty((0, 2))
+    for i in range(len(xs)):
+        labels[i] = -2
+        x = xs[i]
+        v = vs[i]
+        for n in range(cycles):
+            out = walk(later(plant, n * period), x, v, v_belt, period, events, none)
+            x = out[0]
+            v = out[1]
+            if out[3] != OK:
+                labels[i] = -1 if out[3] == CONTACT_LOST else -2
+                break
+            for j in range(len(points)):
+                if abs(x - points[j, 0]) <= tolerance and abs(v - points[j, 1]) <= tolerance:
+                    labels[i] = point_labels[j]
+                    break
+            if labels[i] != -2:
+                break
+        xs[i] = x
+        vs[i] = v
+
+
+@compiled
+def maxima(plant, x, v, v_belt, places):
+    """Follow a motion without excitation and write its maxima of x into ``places`` (n,); one that comes to rest, on
+    the belt or in slip, fills what is left with its place. Return the status and how many were written."""
+    mode = mode_of(plant, x, v, v_belt, 0.0, 0.0)
+    if spring(plant, x)[1] <= 0.0:
+        return CONTACT_LOST, 0
+    n = 0
+    for _ in range(100 * len(places)):
+        if n == len(places):
+            return OK, n
+        if mode == STICK:
+            dt, event = ride_across(plant, x, v_belt, STICK_PATIENCE)
+            rests = event == NO_EVENT
+            x = x if rests else x + v_belt * dt
+            v = v_belt
+            mode = STICK if rests else _breakaway_mode(plant, x, v_belt, 0.0, 0.0)
+        else:
+            _, x, v, event, _, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
+            rests = event == NO_EVENT and abs(v) < STANDSTILL
+            if event == LANDING:
+                mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
+            elif event == TURNING:
+                if slip_forces(plant, mode, x, 0.0, v_belt, 0.0)[0] < 0.0:
+                    places[n] = x
+                    n += 1
+            elif not rests:
+                return CONTACT_LOST if event == CONTACT_LOSS else STEP_LIMIT, n
+        if rests:
+            places[n:] = x
+            return OK, len(places)
+    return EVENT_LIMIT, n

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 
 from sd_friction_env import kernel
-from sd_friction_env.parameters import RANGES, STATE_LIMIT, OscillatorParameters, checked_number
+from sd_friction_env.parameters import EXCITATIONS, RANGES, STATE_LIMIT, OscillatorParameters, checked_number
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.theory import FloatArray, cubic_wells, exact_wells
 
@@ -197,9 +197,11 @@ def equilibria(parameters: OscillatorParameters) -> list[Equilibrium]:
 
 def _check_unexcited(parameters: OscillatorParameters) -> None:
     if parameters.excited:
+        amplitudes = {f"{kind}_amplitude": getattr(parameters, f"{kind}_amplitude") for kind in EXCITATIONS}
+        acting = ", ".join(f"{name} = {value!r}" for name, value in amplitudes.items() if value > 0.0)
         raise ValueError(
-            "parameters must be without excitation here (force_amplitude, ripple_amplitude and stiffness_amplitude 0), "
-            f"got {parameters!r}: see sd_friction_env.forced, or take parameters.unexcited"
+            f"parameters must be without excitation here (all amplitudes 0), got {acting}: "
+            "see sd_friction_env.forced, or take parameters.unexcited"
         )
 
 

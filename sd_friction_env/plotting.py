@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sd_friction_env.basins import Basins
+from sd_friction_env.forced import ForcedBasins
 from sd_friction_env.simulation import Trajectory
 from sd_friction_env.tables import Table, atomic_file
 
@@ -219,4 +220,72 @@ def draw_basins(axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], fo
         if share > 0.0:
             text = f"{names[label + 2]}, {100.0 * share:.1f}%"
             patches.append(Patch(facecolor=colours[label + 2], edgecolor="0.6", label=text))
+    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=4, frameon=False)
+
+
+def draw_bifurcation(axis: "Axes", diagram: Table) -> None:
+    """Draw the section points of :func:`sd_friction_env.forced.bifurcation_diagram`, the way up under the way down."""
+    for way, color, size in (("up", BLACK, 1.6), ("down", VERMILION, 0.5)):
+        part = diagram["direction"] == way
+        if part.any():
+            style = {"linestyle": "none", "marker": ".", "markersize": size, "markeredgewidth": 0.0, "color": color}
+            axis.plot(diagram["value"][part], diagram["x"][part], rasterized=True, **style)
+            axis.plot([], [], linestyle="none", marker="o", markersize=2.0 + 2.0 * size, color=color, label=way)
+    axis.set_ylabel("$x$ on the section")
+    axis.legend(fontsize=8, frameon=False, loc="upper right")
+
+
+def draw_exponents(axis: "Axes", table: Table, floor: float = -0.25) -> None:
+    """Draw the largest exponent over the value of a sweep, with two standard errors; below ``floor`` it is cut off."""
+    for way, color, width, line in (("up", BLACK, 1.6, "-"), ("down", VERMILION, 1.0, (0, (4, 1.2)))):
+        part = table["direction"] == way
+        if part.any():
+            exponent = np.maximum(table["exponent"][part], 2.0 * floor)  # minus infinity too
+            spread = 2.0 * table["standard_error"][part]
+            axis.plot(table["value"][part], exponent, color=color, linewidth=width, linestyle=line, label=way)
+            axis.fill_between(table["value"][part], exponent - spread, exponent + spread, color=color, alpha=0.25)
+    axis.axhline(0.0, color="0.45", linewidth=0.9)
+    axis.set_ylim(bottom=floor)
+    axis.set_ylabel(r"largest exponent $\lambda$")
+
+
+def draw_section(axis: "Axes", section: Table) -> None:
+    """Draw a stroboscopic section, :func:`sd_friction_env.forced.poincare_section`, its stuck states apart."""
+    stuck = section["mode"] == 0
+    for part, color, label in ((~stuck, BLUE, "slip"), (stuck, VERMILION, "stick")):
+        style = {"linestyle": "none", "marker": ".", "markersize": 2.2, "markeredgewidth": 0.0, "color": color}
+        axis.plot(section["x"][part], section["v"][part], rasterized=True, **style)
+        axis.plot([], [], linestyle="none", marker="o", markersize=4.0, color=color, label=label)
+    axis.set_xlabel("$x$")
+    axis.set_ylabel(r"$\dot x$")
+    axis.legend(fontsize=8, frameon=False)
+
+
+def draw_forced_basins(axis: "Axes", found: ForcedBasins) -> None:
+    """Draw a grid of forced basins with the section points of the periodic attractors on it."""
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patches import Patch
+
+    shades = ["#F5F5F5", "#8A8A8A", "#A6CEE3", "#FDD9B5", "#B9E3C6", "#DDC7E8", "#F7EFA5"]
+    names = ["undecided", "contact lost", *(f"period {orbit.multiple}" for orbit in found.attractors)]
+    names += ["chaos"] if found.chaos is not None else []
+    colours = [shades[i % len(shades)] for i in range(len(names))]
+    norm = BoundaryNorm(np.arange(-2.5, len(names) - 2), len(names))
+    axis.grid(visible=False)
+    axis.pcolormesh(
+        found.x, found.v, found.labels, cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True
+    )
+    for orbit, marker in zip(found.attractors, "osD^v<>ph*" * len(found.attractors), strict=False):
+        style = {"linestyle": "none", "markersize": 5.5, "markeredgecolor": "white", "color": BLACK}
+        axis.plot(*orbit.points.T, marker=marker, **style)
+    axis.axhline(found.parameters.belt_speed, color="0.45", linewidth=0.8, linestyle=":")
+    axis.set_xlim(found.x[0], found.x[-1])
+    axis.set_ylim(found.v[0], found.v[-1])
+    axis.set_xlabel("start $x$")
+    axis.set_ylabel(r"start $\dot x$")
+    patches = [
+        Patch(facecolor=colours[i], edgecolor="0.6", label=f"{names[i]}, {100.0 * found.fraction(i - 2):.1f}%")
+        for i in range(len(names))
+        if found.fraction(i - 2) > 0.0
+    ]
     axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=4, frameon=False)

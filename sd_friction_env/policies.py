@@ -12,7 +12,6 @@ call returned. ``episode_start``, shape (n,) or a bool, tells where an episode h
 import dataclasses
 import json
 import os
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ State = tuple[NDArray[Any], ...] | None
 
 NETWORK_FORMAT = 1
 _NETWORK_KIND = "sd_friction_env network policy"
-_LARGEST_GAIN = 1e6
+_LARGEST_GAIN = 1e9
 _GAINS = (-_LARGEST_GAIN, _LARGEST_GAIN)
 
 _ACTIVATIONS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
@@ -180,9 +179,9 @@ class LinearFeedback:
     """Saturated linear feedback: action = bias + gains . (x - x_equilibrium, v, belt modulation), clipped to [-1, 1].
 
     Attributes:
-        gains: action per unit of each quantity in ``readings.names``, each in [-1e6, 1e6].
+        gains: action per unit of each quantity in ``readings.names``, each in [-1e9, 1e9].
         readings: of the environment to be controlled.
-        bias: action at the equilibrium, in [-1e6, 1e6].
+        bias: action at the equilibrium, in [-1e9, 1e9].
 
     Raises:
         TypeError, ValueError: if there is not one such gain for each quantity observed.
@@ -230,7 +229,7 @@ class VelocityFeedback:
     """Saturated velocity feedback: the force u = -gain v, or a belt that follows the mass (belt_speed + gain v).
 
     Attributes:
-        gain: in [-1e6, 1e6]; force per velocity, or change of belt speed per velocity.
+        gain: in [-1e9, 1e9]; force per velocity, or change of belt speed per velocity.
         readings: of the environment to be controlled.
 
     Raises:
@@ -274,7 +273,7 @@ class FilteredFeedback:
     clipped to [-amplitude, amplitude]. With a large ``v_gain`` it is a sliding mode with a boundary layer.
 
     Attributes:
-        x_gain, v_gain: action per unit, in [-1e6, 1e6]. bias: action at the equilibrium, in [-1e6, 1e6].
+        x_gain, v_gain: action per unit, in [-1e9, 1e9]. bias: action at the equilibrium, in [-1e9, 1e9].
         pole: of the filter, in [0, 1); 0: no smoothing.
         amplitude: largest action, in [0, 1].
         control_interval: time between two readings.
@@ -311,7 +310,7 @@ class FilteredFeedback:
     ) -> tuple[Actions, State]:
         """Return the saturated feedback; it remembers the last position and the estimate; see the module."""
         x = self.readings.read(observation)[..., 0]
-        before, estimate = (x, np.zeros_like(x)) if state is None else state
+        before, estimate = (x, np.zeros_like(x)) if state is None else _remembered(state, x.shape, x.shape)
         starts = _starts(episode_start, x)
         before, estimate = np.where(starts, x, before), np.where(starts, 0.0, estimate)
         estimate = self.pole * estimate + (1.0 - self.pole) * (x - before) / self.control_interval
@@ -327,7 +326,7 @@ class DelayedFeedback:
     friction-driven vibration. Until the first delay has passed, it compares with the first reading.
 
     Attributes:
-        gain: action per unit of displacement, in [-1e6, 1e6].
+        gain: action per unit of displacement, in [-1e9, 1e9].
         delay: in control intervals, in [1, 1000].
         readings: of the environment to be controlled.
 
@@ -360,7 +359,10 @@ class DelayedFeedback:
         """Return the saturated feedback; it remembers the positions within the delay; see the module."""
         x = self.readings.read(observation)[..., 0]
         first = np.repeat(x[..., None], self.delay, axis=-1)
-        past = first if state is None else np.where(_starts(episode_start, x)[..., None], first, state[0])
+        past = first
+        if state is not None:
+            (past,) = _remembered(state, first.shape)
+            past = np.where(_starts(episode_start, x)[..., None], first, past)
         action = np.clip(self.gain * (past[..., 0] - x), -1.0, 1.0)
         return action.astype(np.float32)[..., None], (np.concatenate([past[..., 1:], x[..., None]], axis=-1),)
 
@@ -372,7 +374,7 @@ class SlidingMode:
     Source: J.-J. E. Slotine and W. Li, Applied Nonlinear Control (1991), section 7.2.
 
     Attributes:
-        slope: of the sliding line in the phase plane, in [-1e6, 1e6].
+        slope: of the sliding line in the phase plane, in [-1e9, 1e9].
         layer: half its width in velocity, in [1e-6, 1e6].
         amplitude: largest action, in [-1, 1]; negative: the other way, for a belt that is to follow the mass.
         readings: of the environment to be controlled.
@@ -413,6 +415,17 @@ class SlidingMode:
 def _check_numbers(controller: Any, ranges: Mapping[str, tuple[float, float]]) -> None:
     for name, (low, high) in ranges.items():
         object.__setattr__(controller, name, checked_number(name, getattr(controller, name), low, high))
+
+
+def _remembered(state: tuple[NDArray[Any], ...], *shapes: tuple[int, ...]) -> tuple[NDArray[Any], ...]:
+    """Return a state, if it is what the last call returned for as many observations: others would be broadcast."""
+    found = tuple(np.shape(part) for part in state)
+    if found != shapes:
+        raise ValueError(
+            f"state must be what the last call returned for as many observations, of shapes "
+            f"{', '.join(map(str, shapes))}; got {', '.join(map(str, found)) or 'nothing'}"
+        )
+    return state
 
 
 def _starts(episode_start: ArrayLike | None, like: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -514,9 +527,8 @@ class NetworkPolicy:
         size = self.observation_size
         window = np.zeros((len(batch), self.frames * size), np.float32)
         if state is not None:
-            if len(state) != 1 or state[0].shape != window.shape:
-                raise ValueError(f"state must be what the last call returned, for a batch of {len(batch)}")
-            window[:, :-size] = state[0][:, size:]
+            (before,) = _remembered(state, window.shape)
+            window[:, :-size] = before[:, size:]
             if episode_start is not None:
                 window[np.broadcast_to(np.asarray(episode_start, dtype=bool), (len(batch),))] = 0.0
         window[:, -size:] = batch
@@ -562,20 +574,33 @@ def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
     if not target.exists():
         raise FileNotFoundError(f"there is no policy file {name!r}")
     try:
-        # Opened here, for np.load leaves a file that it refuses open.
-        with open(target, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            header = json.loads(str(archive["header"]))
-            if not isinstance(header, dict) or header.get("kind") != _NETWORK_KIND:
-                raise PolicyFileError(f"{name!r} is not a policy of sd_friction_env")
-            if header["format"] != NETWORK_FORMAT:
-                raise PolicyFileError(
-                    f"{name!r} has policy format {header['format']!r}; this version reads {NETWORK_FORMAT}"
-                )
-            layers = tuple((archive[f"weights_{i}"], archive[f"bias_{i}"]) for i in range(int(header["layers"])))
-            return NetworkPolicy(
-                layers, header["activation"], header["output"], int(header["frames"]), header["metadata"]
+        (text,) = read_arrays(target, "header")
+        header = json.loads(str(text))
+        if not isinstance(header, dict) or header.get("kind") != _NETWORK_KIND:
+            raise PolicyFileError(f"{name!r} is not a policy of sd_friction_env")
+        if header["format"] != NETWORK_FORMAT:
+            raise PolicyFileError(
+                f"{name!r} has policy format {header['format']!r}; this version reads {NETWORK_FORMAT}"
             )
+        count = int(header["layers"])
+        arrays = read_arrays(target, *(f"{part}_{i}" for i in range(count) for part in ("weights", "bias")))
+        layers = tuple(zip(arrays[::2], arrays[1::2], strict=True))
+        return NetworkPolicy(layers, header["activation"], header["output"], int(header["frames"]), header["metadata"])
     except PolicyFileError:
         raise
-    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise PolicyFileError(f"{name!r} is not a policy of sd_friction_env, or is damaged: {error}") from None
+    except Exception as error:  # see read_arrays
+        raise PolicyFileError(
+            f"{name!r} is not a policy of sd_friction_env, or is damaged: {type(error).__name__}: {error}"
+        ) from None
+
+
+def read_arrays(path: str | os.PathLike[str], *names: str) -> list[NDArray[Any]]:
+    """Return arrays of an .npz file by name; nothing in the file is ever executed.
+
+    Raises:
+        Exception: of any kind, if the file is damaged: a few wrong bytes make the archive, its compression, its
+            encryption or an array's header fail, each in ways of its own. Callers name the file.
+    """
+    # Opened here, for np.load leaves a file that it refuses open.
+    with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+        return [archive[name] for name in names]

@@ -15,7 +15,9 @@ from sd_friction_env.policies import NetworkPolicy, PolicyFileError, load_policy
 PRETRAINED = Path(__file__).parent / "pretrained_agents"
 
 _GOLDEN_STEPS = 60
-_GOLDEN_TOLERANCE = 1e-6  # other builds round differently, and stick-slip may amplify that; a changed law moves 1e-3
+# Where another build rounds differently, an observation's last digit in single precision may flip (2e-7); a friction
+# coefficient changed by a thousandth moves 3e-4.
+_GOLDEN_TOLERANCE = 1e-6
 
 
 def bare_id(env_id: str) -> str:
@@ -59,17 +61,34 @@ def _described(space: gym.Space[Any]) -> dict[str, Any]:
 
 
 def changes_since(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return what differs between two fingerprints, in words; nothing if the environment is the same."""
+    """Return what differs between two fingerprints, in words; nothing if the environment is the same.
+
+    What a stored one lacks differs too: a foreign one does not pass for the same environment.
+    """
     changed = []
-    for part, values in stored["configuration"].items():
-        present = now["configuration"].get(part, {})
+    configuration = stored.get("configuration")
+    parts = configuration if isinstance(configuration, Mapping) else {}
+    for part, present in now["configuration"].items():
+        values = parts.get(part)
+        if not isinstance(values, Mapping) or not values:
+            changed.append(f"{part}: nothing is stored of it")
+            continue
         # An argument that is new since then has a default; whether that changes anything, the golden episode tells.
         names = sorted(name for name in values if values[name] != present.get(name))
         changed += [f"{part} {name}: {values[name]!r} -> {present.get(name)!r}" for name in names]
-    before, after = np.array(stored["golden"]), np.array(now["golden"])
-    if before.shape != after.shape or not np.allclose(before, after, rtol=0.0, atol=_GOLDEN_TOLERANCE):
+    changed += [f"{part}: it is unknown" for part in sorted(set(parts) - set(now["configuration"]))]
+    if not close(stored.get("golden", []), now["golden"], _GOLDEN_TOLERANCE):
         changed.append("the dynamics, the observation or the reward")
     return changed
+
+
+def close(stored: Any, now: Any, tolerance: float) -> bool:
+    """Return whether what is stored are numbers of the same shape as those of now, none farther off than that."""
+    try:
+        before, after = np.array(stored, dtype=float), np.array(now, dtype=float)
+    except (TypeError, ValueError):  # ragged, or no numbers
+        return False
+    return before.shape == after.shape and bool(np.allclose(before, after, rtol=0.0, atol=tolerance))
 
 
 def load_pretrained(env_id: str) -> NetworkPolicy:

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.basins import Basins, basins, checked_grid
 from sd_friction_env.curves import amplitude_curve, attractor_curves, checked_belt_speeds, cycle_table
+from sd_friction_env.forced import Direction, bifurcation_diagram
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_choice, checked_number
 from sd_friction_env.tables import Table, atomic_file
 
@@ -298,7 +299,7 @@ def amplitude_sweep(
     speeds = checked_belt_speeds(belt_speeds)
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
     v = None if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
-    size = _checked_chunk(chunk)
+    size = _checked_count("chunk", chunk, 1)
     pieces = [speeds[i : i + size] for i in range(0, len(speeds), size)]
     chunks = [(plant, piece, x, v, all_attractors) for plant in plants for piece in pieces]
     description = {
@@ -342,7 +343,7 @@ def basin_sweep(
         SweepError: see :func:`run_chunks`.
     """
     x, v = checked_grid(x_limits, v_limits, shape)
-    rows = max(1, _checked_chunk(chunk) // len(x))
+    rows = max(1, _checked_count("chunk", chunk, 1) // len(x))
     description = {
         "what": "basins",
         "parameters": dataclasses.asdict(parameters),
@@ -363,8 +364,52 @@ def _basin_chunk(chunk: tuple[OscillatorParameters, NDArray[np.float64], NDArray
     return {"labels": basins(parameters, x[None, :], v[:, None], threads=1).labels}
 
 
-def _checked_chunk(chunk: int) -> int:
-    size = checked_number("chunk", chunk, 1, 1e9)
-    if size != int(size):
-        raise ValueError(f"chunk must be a whole number in [1, 1e9], got {chunk!r}")
-    return int(size)
+def bifurcation_sweep(
+    plants: Sequence[OscillatorParameters],
+    name: str,
+    values: ArrayLike,
+    engine: Engine,
+    *,
+    direction: Direction = "up",
+    cycles: int = 100,
+    transient: int = 200,
+    lyapunov: bool = False,
+) -> list[Table]:
+    """Return the bifurcation diagram of each plant, as :func:`sd_friction_env.forced.bifurcation_diagram` does, bit for
+    bit. A diagram is one chunk, for each of its values starts where the one before ended.
+
+    Args:
+        plants: (n,) oscillators. engine: where it runs. The others: as of ``bifurcation_diagram``.
+
+    Raises:
+        TypeError, ValueError: if an argument is not as said, before anything is computed.
+        SweepError: see :func:`run_chunks`.
+    """
+    cycles, transient = _checked_count("cycles", cycles, 1), _checked_count("transient", transient, 0)
+    numbers = np.unique(np.asarray(values, dtype=np.float64)).tolist()
+    for plant in plants:
+        for value in numbers[1:]:
+            plant.replace(**{name: value})
+        # What a diagram would refuse, one of the first value refuses at once.
+        bifurcation_diagram(plant, name, numbers[:1], direction=direction, cycles=20, transient=0, lyapunov=lyapunov)
+    arguments = {"direction": direction, "cycles": cycles, "transient": transient, "lyapunov": bool(lyapunov)}
+    chunks = [(plant, name, numbers, arguments) for plant in plants]
+    described = [dataclasses.asdict(plant) for plant in plants]
+    description = {"what": "bifurcation", "plants": described, "name": name, "values": numbers, **arguments}
+    results = run_chunks(_diagram_chunk, chunks, engine, description=description)
+    return [
+        Table(columns, {"parameters": dataclasses.asdict(plant), "swept": name})
+        for columns, plant in zip(results, plants, strict=True)
+    ]
+
+
+def _diagram_chunk(chunk: tuple[OscillatorParameters, str, list[float], dict[str, Any]]) -> Columns:
+    plant, name, values, arguments = chunk
+    return dict(bifurcation_diagram(plant, name, values, **arguments))
+
+
+def _checked_count(name: str, value: int, low: int) -> int:
+    number = checked_number(name, value, low, 1e9)
+    if number != int(number):
+        raise ValueError(f"{name} must be a whole number in [{low}, 1e9], got {value!r}")
+    return int(number)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from agents import classical, evaluation
+from agents import classical, evaluation, optimal
 from agents.evaluation import Episodes, evaluate, metrics, run_episodes, score, summarise
 from scripts import evaluate as script
 from sd_friction_env import OscillatorParameters, Table, limit_cycle
@@ -264,6 +264,47 @@ def test_foreign_environments_and_missing_seeds_are_refused():
         run_episodes(ZeroPolicy(), "CartPole-v1", [1])
     with pytest.raises(ValueError, match="seeds must be"):
         run_episodes(ZeroPolicy(), FORCE, [])
+
+
+@pytest.mark.parametrize(
+    ("seeds", "message"),
+    [
+        ([1.7], r"got 1\.7 among them"),
+        ([1, 2.0], r"got 2\.0 among them"),
+        (["12"], "got '12' among them"),
+        ("12", "got '12'"),
+        ([None], "got None among them"),
+        ([True], "got True among them"),
+        (7, "got 7"),
+        ([3, -2], "got -2 among them"),
+        ([], "got none"),
+    ],
+)
+def test_seeds_that_are_no_whole_numbers_are_refused_by_name(seeds, message):
+    for evaluated in (evaluation.checked_seeds, lambda seeds: evaluation.passive_episodes(FORCE, seeds)):
+        with pytest.raises((TypeError, ValueError), match=f"seeds must be .*{message}"):
+            evaluated(seeds)
+    with pytest.raises((TypeError, ValueError), match=f"seeds must be .*{message}"):
+        run_episodes(ZeroPolicy(), FORCE, seeds)
+
+
+def test_seeds_may_be_of_any_kind_of_whole_number():
+    assert evaluation.checked_seeds(np.array([3, 4])) == evaluation.checked_seeds(range(3, 5)) == [3, 4]
+    assert all(type(seed) is int for seed in evaluation.checked_seeds([np.int64(3), np.uint8(4)]))
+
+
+@pytest.mark.parametrize("damage", [lambda text: text[: len(text) // 2], lambda text: "", lambda text: "[]"])
+def test_a_damaged_optimum_is_told_as_such_and_not_as_missing(tmp_path, monkeypatch, damage, capsys):
+    whole = (optimal.OPTIMUM_DIRECTORY / "belt.json").read_text(encoding="utf-8")
+    (tmp_path / "belt.json").write_text(damage(whole), encoding="utf-8")
+    monkeypatch.setattr(optimal, "OPTIMUM_DIRECTORY", tmp_path)
+    assert evaluation.optimal_returns(FORCE, [1_000_000]) is None  # here none is stored
+    with pytest.raises(RuntimeError, match=r"belt\.json.* or is damaged .*scripts/optimum\.py --task belt`"):
+        evaluation.optimal_returns(BELT, [1_000_000])
+    assert script.main(["--task", "belt", "--episodes", "2"]) == 1
+    error = capsys.readouterr().err
+    assert "belt.json" in error
+    assert error.count("\n") == 1
 
 
 def test_no_optimum_is_claimed_where_none_is_known():

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import zipfile
+import zlib
 
 import gymnasium as gym
 import numpy as np
@@ -243,6 +245,117 @@ def test_saving_and_reading_keeps_returns_and_sequences(tmp_path):
     stored_seeds, stored = optimal.optimal_actions(problem.env_id, directory=tmp_path)
     assert stored_seeds == seeds
     np.testing.assert_allclose(stored, actions, atol=1.0 / optimal.ACTION_LEVELS)
+
+
+def damaged_copies(path):
+    """Yield the path with one damage after another done to its file: cut short, or a bit flipped."""
+    good = path.read_bytes()
+    rng = np.random.default_rng(0)
+    places = np.unique(
+        np.concatenate([np.arange(0, 200), rng.integers(len(good), size=150), len(good) - np.arange(1, 400)])
+    )
+    for place in places.tolist():
+        flipped = bytearray(good)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        for content in (bytes(flipped), good[:place]):
+            path.write_bytes(content)
+            yield content
+    path.write_bytes(good)
+
+
+@pytest.fixture
+def unchanging(monkeypatch):
+    """Take every fingerprint for that of now: only what reading refuses is refused, and it is quick."""
+    monkeypatch.setattr(optimal, "check_fingerprint", lambda *arguments: None)
+
+
+def test_no_damage_to_a_value_function_comes_out_as_anything_but_a_policy_file_error(tmp_path, unchanging):
+    problem = optimal.make_problem(TASKS["force"], [0])
+    grid = optimal.make_grid(problem, (5, 5))
+    path = optimal.save_value(problem, optimal.ValueFunction(grid, np.zeros(25), np.zeros(25)), tmp_path)
+    refused = []
+    for _ in damaged_copies(path):
+        try:
+            OptimalPolicy.load(TASKS["force"], tmp_path)
+        except PolicyFileError as error:
+            refused.append(str(error))
+    assert len(refused) > 500
+    assert all(repr(str(path)) in error for error in refused)
+    OptimalPolicy.load(TASKS["force"], tmp_path)
+
+
+@pytest.mark.parametrize("error", [EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error])
+def test_whatever_reading_a_value_function_trips_over_names_the_file(monkeypatch, error):
+    def trip(*arguments, **more):
+        raise error("tripped")
+
+    monkeypatch.setattr(np.lib.npyio.NpzFile, "__getitem__", trip)
+    with pytest.raises(PolicyFileError, match=rf"belt-value\.npz.*{error.__name__}: tripped.*--task belt --policy`"):
+        OptimalPolicy.load(TASKS["belt"])
+    with pytest.raises(optimal.DamagedStudyError, match=rf"belt\.npz.*{error.__name__}: tripped"):
+        optimal.optimal_actions(TASKS["belt"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"lows": np.zeros(3)},
+        {"highs": np.full(2, -9.0)},
+        {"values": np.zeros((5, 5, 5))},
+        {"values": np.full((5, 5), np.nan)},
+        {"values": np.zeros((1, 5))},
+        {"fingerprint": np.array("[]")},
+    ],
+)
+def test_a_value_function_that_cannot_be_is_refused_by_name(tmp_path, unchanging, change):
+    problem = optimal.make_problem(TASKS["force"], [0])
+    grid = optimal.make_grid(problem, (5, 5))
+    path = optimal.save_value(problem, optimal.ValueFunction(grid, np.zeros(25), np.zeros(25)), tmp_path)
+    with np.load(path) as archive:
+        content = dict(archive)
+    np.savez(path, **content | change)
+    with pytest.raises(PolicyFileError, match=r"force-value\.npz"):
+        OptimalPolicy.load(TASKS["force"], tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content.pop("returns"),
+        lambda content: content["seeds"].pop(),
+        lambda content: content.update(seeds=[], returns=[]),
+        lambda content: content["returns"].__setitem__(3, float("nan")),
+        lambda content: content["seeds"].__setitem__(3, 1.5),
+        lambda content: content.update(fingerprint="4f2a"),
+        lambda content: content.update(env_id=TASKS["belt"]),
+    ],
+)
+def test_a_table_of_optima_that_cannot_be_is_refused_by_name(tmp_path, change):
+    content = json.loads((optimal.OPTIMUM_DIRECTORY / "force.json").read_text(encoding="utf-8"))
+    change(content)
+    (tmp_path / "force.json").write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(optimal.DamagedStudyError, match=r"force\.json.* or is damaged .*--task force`"):
+        optimal.optimal_returns(TASKS["force"], [1_000_000], directory=tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content.update(fingerprint={}),
+        lambda content: content["fingerprint"].update(configuration={}),
+        lambda content: content["fingerprint"]["configuration"].pop("task"),
+        lambda content: content["fingerprint"]["configuration"].update(parameters={}),
+        lambda content: content["fingerprint"].update(golden=[]),
+        lambda content: content["fingerprint"].update(golden=[[1.0], [1.0, 2.0]]),
+        lambda content: content["fingerprint"].pop("starts"),
+    ],
+)
+def test_a_fingerprint_that_lacks_something_is_that_of_another_environment(tmp_path, change):
+    content = json.loads((optimal.OPTIMUM_DIRECTORY / "force.json").read_text(encoding="utf-8"))
+    change(content)
+    (tmp_path / "force.json").write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(RuntimeError, match="was computed for another environment"):
+        optimal.optimal_returns(TASKS["force"], [1_000_000], directory=tmp_path)
 
 
 # The policy that acts on a value function -----------------------------------------------------------------------------

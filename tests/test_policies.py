@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 import zipfile
+import zlib
 
 import gymnasium as gym
 import numpy as np
@@ -312,3 +313,83 @@ def test_foreign_and_malicious_files_are_refused_and_never_run(tmp_path):
         with pytest.raises(PolicyFileError, match=r"file\.npz"):
             load_policy(tmp_path / "file.npz")
     assert not trap.exists()
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_no_damage_to_a_file_comes_out_as_anything_but_a_policy_file_error(tmp_path, save):
+    """Zip, deflate, NumPy's headers and JSON all fail in ways of their own; a flipped byte may also do no harm."""
+    path = tmp_path / "policy.npz"
+    small_network().save(path)
+    with np.load(path) as archive:
+        save(path, **archive)
+    good = path.read_bytes()
+    rng = np.random.default_rng(0)
+    damaged = [good[:length] for length in range(0, len(good), 23)]
+    for place in range(len(good)):
+        flipped = bytearray(good)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        damaged.append(bytes(flipped))
+    refused = []
+    for content in damaged:
+        path.write_bytes(content)
+        try:
+            load_policy(path)
+        except PolicyFileError as error:
+            refused.append(str(error))
+    assert len(refused) > len(good) // 4
+    assert all(repr(str(path)) in error for error in refused)
+
+
+@pytest.mark.parametrize("error", [EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error])
+def test_whatever_reading_trips_over_names_the_file(tmp_path, monkeypatch, error):
+    small_network().save(tmp_path / "policy.npz")
+
+    def trip(*arguments, **more):
+        raise error("tripped")
+
+    monkeypatch.setattr(np.lib.npyio.NpzFile, "__getitem__", trip)
+    with pytest.raises(PolicyFileError, match=rf"policy\.npz.*{error.__name__}: tripped"):
+        load_policy(tmp_path / "policy.npz")
+
+
+def with_memory(env):
+    return {
+        "filtered": FilteredFeedback.from_env(env, x_gain=1.0, v_gain=-3.0, pole=0.6),
+        "delayed": DelayedFeedback.from_env(env, 3.0, 4),
+        "window": small_network(frames=3),
+    }
+
+
+@pytest.mark.parametrize("name", ["filtered", "delayed", "window"])
+@pytest.mark.parametrize(("before", "now"), [((1, 2), (5, 2)), ((5, 2), (1, 2)), ((3, 2), (2,)), ((2,), (3, 2))])
+def test_a_memory_of_another_batch_is_refused_and_not_stretched(name, before, now):
+    policy = with_memory(make())[name]
+    _, state = policy.predict(np.zeros(before))
+    with pytest.raises(ValueError, match=r"state must be what the last call returned .*; got"):
+        policy.predict(np.zeros(now), state)
+    with pytest.raises(ValueError, match=r"state must be what the last call returned .*; got"):
+        policy.predict(np.zeros(before), ())
+
+
+def test_the_refusal_of_a_memory_names_both_sizes():
+    policy = with_memory(make())["filtered"]
+    _, state = policy.predict(np.zeros((4, 2)))
+    with pytest.raises(ValueError, match=r"of shapes \(7,\), \(7,\); got \(4,\), \(4,\)"):
+        policy.predict(np.zeros((7, 2)), state)
+
+
+def test_filtered_feedback_forgets_position_and_estimate_where_an_episode_begins():
+    env = make("SDFriction/ForceSensed-v0")
+    policy = FilteredFeedback.from_env(env, x_gain=0.5, v_gain=-2.0, pole=0.75)
+    place = Readings.from_env(env).x_equilibrium
+    seen = [
+        np.array([observe(env, place + x, 0.0)[:1] for x in pair]) for pair in ((0.0, 0.0), (0.01, 0.01), (0.01, 0.03))
+    ]
+    _, state = policy.predict(seen[0])
+    moving, state = policy.predict(seen[1], state, np.array([False, False]))
+    assert (moving < 0.0).all()
+    after, state = policy.predict(seen[2], state, np.array([False, True]))
+    fresh, _ = policy.predict(seen[2])
+    assert after[1] == fresh[1]  # as if nothing had been before
+    assert after[0] < fresh[0]  # the other still believes that it moves
+    assert state[1][1] == 0.0

@@ -60,6 +60,10 @@ def changed_file(tmp_path, monkeypatch, change):
     monkeypatch.setattr(pretrained, "PRETRAINED", tmp_path)
 
 
+def shift_golden(metadata, by):
+    metadata["fingerprint"]["golden"][5][1] += by
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -67,6 +71,17 @@ def changed_file(tmp_path, monkeypatch, change):
         (lambda m: m["fingerprint"]["configuration"]["parameters"].update(alpha=0.7), "parameters alpha: 0.7 -> 0.8"),
         (lambda m: m["fingerprint"]["configuration"]["observation"].update(shape=[3]), "observation shape"),
         (lambda m: m["fingerprint"]["golden"][5].__setitem__(1, 0.5), "the dynamics, the observation or the reward"),
+        (lambda m: shift_golden(m, 2e-6), "the dynamics, the observation or the reward"),
+        (lambda m: m["fingerprint"].update(golden=[]), "the dynamics, the observation or the reward"),
+        (lambda m: m["fingerprint"].update(golden=[[1.0], [1.0, 2.0]]), "the dynamics, the observation or the reward"),
+        (lambda m: m["fingerprint"].update(golden="none"), "the dynamics, the observation or the reward"),
+        (lambda m: m["fingerprint"].clear(), "task: nothing is stored of it"),
+        (lambda m: m.update(fingerprint={"hash": "4f2a"}), "parameters: nothing is stored of it"),
+        (lambda m: m["fingerprint"].update(configuration={}), "observation: nothing is stored of it"),
+        (lambda m: m["fingerprint"]["configuration"].pop("task"), "task: nothing is stored of it"),
+        (lambda m: m["fingerprint"]["configuration"].update(task={}), "task: nothing is stored of it"),
+        (lambda m: m["fingerprint"]["configuration"].update(task="easy"), "task: nothing is stored of it"),
+        (lambda m: m["fingerprint"]["configuration"].update(weather={"rain": True}), "weather: it is unknown"),
         (lambda m: m.update(env_id="SDFriction/BeltSpeed-v0"), "is not an agent for SDFriction/Force-v0"),
         (lambda m: m.pop("fingerprint"), "is not an agent for SDFriction/Force-v0"),
     ],
@@ -75,6 +90,22 @@ def test_an_agent_of_another_environment_is_refused(change, said, tmp_path, monk
     changed_file(tmp_path, monkeypatch, change)
     with pytest.raises(PolicyFileError, match=said):
         load_pretrained("SDFriction/Force-v0")
+
+
+def test_a_fingerprint_allows_for_rounding_and_for_no_change_of_a_law():
+    """The tolerance lies between what single precision rounds (6e-8 of an observation up to some units) and what the
+    smallest change of a law does: a friction coefficient off by a thousandth."""
+    now = pretrained.fingerprint("SDFriction/BeltSpeed-v0")
+    rounded = json.loads(json.dumps(now))
+    for row in rounded["golden"]:
+        row[:] = [float(np.nextafter(np.float32(value), np.float32(9.0))) for value in row]
+    assert rounded != now
+    assert pretrained.changes_since(rounded, now) == []
+    other = pretrained.fingerprint("SDFriction/BeltSpeed-v0", {"parameters": {"mu_m": 0.05 * 1.001}})
+    assert pretrained.changes_since(now | {"golden": other["golden"]}, now) == [
+        "the dynamics, the observation or the reward"
+    ]
+    assert np.abs(np.array(other["golden"]) - now["golden"]).max() > 10.0 * pretrained._GOLDEN_TOLERANCE
 
 
 def test_an_environment_without_agent_is_named_with_those_that_have_one():

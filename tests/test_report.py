@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents import classical, evaluation, report, runs
+from agents import classical, evaluation, optimal, report, runs
 from agents.report import ENV_IDS, QUICK, Effort, Replay, Report
 from scripts import report as script
 from scripts.train import TASKS, TIERS, environment_id
@@ -146,7 +146,7 @@ def test_the_best_classical_controller_is_shown_and_what_is_missing_is_said(monk
     assert rows["optimum"]["episodes"] == 2
 
     def none(env_id):
-        raise ValueError("none")
+        raise classical.NotTunedError("none")
 
     monkeypatch.setattr(classical, "classical_controllers", none)
     monkeypatch.setattr(evaluation, "optimal_returns", lambda *arguments: None)
@@ -157,6 +157,74 @@ def test_the_best_classical_controller_is_shown_and_what_is_missing_is_said(monk
     assert len(made.remarks()) == 2
     assert all(remark.endswith(": force nominal, force sensed.") for remark in made.remarks())
     assert "optimum" not in {row["kind"] for row in made.comparisons["force", "nominal"].rows}
+
+
+def test_a_damaged_file_of_gains_or_optima_is_told_and_not_taken_for_a_missing_one(tmp_path, monkeypatch, capsys):
+    (tmp_path / "classical.json").write_text('{"gains": {', encoding="utf-8")
+    command = ["--quick", "--task", "belt", "--tier", "nominal", "--no-progress", "--out", str(tmp_path / "out")]
+    with monkeypatch.context() as patch:
+        patch.setattr(classical, "GAINS_FILE", tmp_path / "classical.json")
+        with pytest.raises(ValueError, match=r"classical\.json"):
+            report.compare(("belt", "nominal"), [], FEW, 0)
+        with pytest.raises(SystemExit):
+            script.main(command)
+        assert "classical.json" in capsys.readouterr().err
+    (tmp_path / "belt.json").write_text('{"env_id": ', encoding="utf-8")
+    monkeypatch.setattr(optimal, "OPTIMUM_DIRECTORY", tmp_path)
+    assert script.main(command) == 1
+    error = capsys.readouterr().err
+    assert "belt.json" in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def row_of(kind, name, score, runs=1, **more):
+    return {"kind": kind, "controller": name, "score": score, "runs": runs, "suppressed": 0.5} | more
+
+
+def test_the_summary_shows_the_best_of_each_kind_and_of_agents_the_best_of_those_with_most_runs():
+    interval = {"score_low": 0.1, "score_high": 0.9}
+    rows = [
+        row_of("baseline", "passive", 0.0),
+        row_of("baseline", "constant -1", 0.4),
+        row_of("baseline", "constant +1", 0.95),
+        row_of("classical", "unscored", float("nan")),
+        row_of("classical", "worst", 0.2),
+        row_of("classical", "best", 0.7, suppressed=0.25),
+        row_of("classical", "middling", 0.5),
+        row_of("learned", "LUCKY", 0.99, **interval),
+        row_of("learned", "WORSE", 0.3, 5, **interval),
+        row_of("learned", "BETTER", 0.6, 5, **interval),
+        row_of("optimum", "optimum", 1.0),
+    ]
+    made = Report([], [])
+    made.comparisons = {
+        ("force", "nominal"): report.Comparison(rows, [], {}, []),
+        ("belt", "sensed"): report.Comparison([*rows[:2], row_of("learned", "ALONE", 0.3, **interval)], [], {}, []),
+    }
+    assert made.summary().splitlines()[2:] == [
+        "| force, nominal | 0.400, 50% | best: 0.700, 25% | BETTER (5 runs): 0.600 [0.100, 0.900], 50% |",
+        "| belt, sensed | 0.400, 50% | - | ALONE (1 run): 0.300 [0.100, 0.900], 50% |",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "scored", "told"),
+    [("optimum", 4, True), ("optimum", 3, False), ("learned", 4, False)],
+)
+def test_times_to_a_score_need_the_optimum_of_every_episode(tmp_path, kind, scored, told):
+    """On the randomised tier the optimum of some of the episodes is known: its mean is of others than the agent's."""
+    make_run(tmp_path, "force-nominal-ppo-0", -1.0)
+    make_run(tmp_path, "force-sensed-ppo-0", -1.0)
+    made = Report(report.find_agents(tmp_path)[0], [("force", "nominal")])
+    passive = row_of("baseline", "passive", 0.0, **{"return": -500.0, "episodes": 4, "scored_episodes": scored})
+    last = row_of(kind, kind, 1.0, **{"return": -50.0, "episodes": scored, "scored_episodes": scored})
+    made.comparisons = {("force", "nominal"): report.Comparison([passive, last], [], {}, [])}
+    made._learn()
+    assert {row["tier"] for row in made.learning} == {"nominal"}  # what is not reported is left out
+    assert [row["run"] for row in made.training] == (["force-nominal-ppo-0"] if told else [])
+    for row in made.training:  # -400 and -80: of the way from -500 to -50, .22 and .93
+        assert row["seconds_to_0.9"] == 3.0
 
 
 def test_a_replay_gives_each_episode_its_own_actions():

@@ -180,7 +180,7 @@ def make_problem(env_id: str, seeds: Sequence[int]) -> Problem:
     return Problem(env_id, env.task, tuple(parameters), starts)
 
 
-def _constants(task: Task, parameters: OscillatorParameters) -> tuple[float, ...]:
+def _constants(task: Task, parameters: OscillatorParameters) -> tuple[float | kernel.Laws | None, ...]:
     """Return what ``kernel.control_interval`` takes before the state, in its order."""
     return (
         *parameters.plant,

@@ -141,7 +141,8 @@ def _command(
     return parser
 
 
-def _add_engine(parser: argparse.ArgumentParser) -> None:
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where a sweep runs."""
     group = parser.add_argument_group("where it runs", "the result is the same, bit for bit")
     text = "this process, processes of this machine, or a cluster (default: sequential)"
     group.add_argument("--backend", choices=sweeps.BACKENDS, default="sequential", help=text)
@@ -152,7 +153,8 @@ def _add_engine(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--folder", type=Path, metavar="FOLDER", help=text)
 
 
-def _engine(options: argparse.Namespace) -> sweeps.Engine:
+def engine_of(options: argparse.Namespace) -> sweeps.Engine:
+    """Return where a sweep runs by the options of :func:`add_engine`; its progress is shown on a terminal."""
     show: list[Callable[[int], None]] = []
 
     def progress(done: int, total: int) -> None:
@@ -206,7 +208,7 @@ def parser() -> argparse.ArgumentParser:
     )
     _add_start(command)
     command.add_argument("--attractors", action="store_true", help="all attractors of every point, whatever the start")
-    _add_engine(command)
+    add_engine(command)
     _add_output(command, "amplitude over the belt speed")
 
     command = _command(
@@ -252,7 +254,7 @@ def parser() -> argparse.ArgumentParser:
             "--alpha 0.5 --shape 4000 2500 --backend dask --address tcp://10.0.0.1:8786 --folder basins-alpha-5",
         ],
     )
-    _add_engine(command)
+    add_engine(command)
     command.add_argument("--x", nargs=2, type=float, default=[-1.5, 1.5], metavar=("LOW", "HIGH"), help="starts in x")
     command.add_argument("--v", nargs=2, type=float, default=[-1.0, 1.0], metavar=("LOW", "HIGH"), help="starts in v")
     command.add_argument("--shape", nargs=2, type=int, default=[400, 400], metavar=("N", "M"), help="grid (400 400)")
@@ -297,7 +299,7 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--cycles", type=int, default=60, help="drive periods told of (default: 60)")
     command.add_argument("--transient", type=int, default=200, help="drive periods before (default: 200)")
     command.add_argument("--exponents", action="store_true", help="the largest Lyapunov exponent of each as well")
-    _add_engine(command)
+    add_engine(command)
     _add_output(command, "the diagram")
 
     command = _bare_command(
@@ -480,7 +482,7 @@ def _amplitude(options: argparse.Namespace) -> int:
     if options.attractors and options.start is not None:
         raise UsageError("--start and --attractors exclude each other: all attractors need no start")
     curves = sweeps.amplitude_sweep(
-        [parameters for _, parameters in grid], speeds, _engine(options), x=x, v=v, all_attractors=options.attractors
+        [parameters for _, parameters in grid], speeds, engine_of(options), x=x, v=v, all_attractors=options.attractors
     )
     table = _stack(
         (_with_columns(curve, swept) for curve, (swept, _) in zip(curves, grid, strict=True)), _metadata(options)
@@ -547,10 +549,10 @@ def _basins(options: argparse.Namespace) -> int:
     parameters = _one(options)
     x_limits, v_limits, shape = tuple(options.x), tuple(options.v), tuple(options.shape)
     if options.backend == "sequential" and options.folder is None:
-        _engine(options)  # refuses what does not go with it
+        engine_of(options)  # refuses what does not go with it
         x, v, found = basin_grid(parameters, x_limits, v_limits, shape)  # on all cores
     else:
-        x, v, found = sweeps.basin_sweep(parameters, x_limits, v_limits, shape, _engine(options))
+        x, v, found = sweeps.basin_sweep(parameters, x_limits, v_limits, shape, engine_of(options))
     names = [f"{cycle.kind} round x = {0.5 * (cycle.x_max + cycle.x_min):.4f}" for cycle in found.attractors]
     rows: list[dict[str, Any]] = []
     for label, name in [*enumerate(names), (LOST_CONTACT, "contact lost"), (UNDECIDED, "undecided")]:
@@ -606,7 +608,7 @@ def _bifurcation(options: argparse.Namespace) -> int:
         [parameters for _, parameters in grid],
         name,
         values,
-        _engine(options),
+        engine_of(options),
         direction=options.direction,
         cycles=options.cycles,
         transient=options.transient,

@@ -80,7 +80,7 @@ class ForcedOrbit:
         points: the section points (x, v) of one period, (multiple, 2); the first is (x, v).
         amplitude, x_min, x_max: (x_max - x_min)/2 and the extremes of x.
         stick_fraction: share of the period spent stuck. sticks, forward_arcs: how many begin in a period.
-        multipliers: Floquet multipliers, (2,), the greater modulus first; the second is 0 where the motion sticks.
+        multipliers: Floquet multipliers, the greater modulus first; the second is 0 where the motion sticks.
         stable: whether both moduli are less than 1.
         singular_events: events in a period without a derivative; the multipliers mean nothing unless it is 0.
         parameters: of the oscillator.
@@ -112,7 +112,7 @@ class ForcedBasins:
         x, v: axes of the grid, shapes (n,) and (m,).
         labels: of each start, (m, n): index into ``attractors``; len(attractors) for chaos; -1 the mass loses contact,
             -2 not decided.
-        attractors: the periodic ones. chaos: the exponent of the chaotic one, or None.
+        attractors: the periodic ones, the left-most first. chaos: the exponent of the chaotic one, or None.
         parameters: of the oscillator.
     """
 
@@ -711,11 +711,14 @@ def forced_basins(
             break
     if chaos is not None:
         labels[labels == UNDECIDED] = len(found)
+    order = sorted(range(len(found)), key=lambda i: found[i].x_min)
+    for label, its_own in enumerate([labels == i for i in order]):
+        labels[its_own] = label
     return ForcedBasins(
         x=axes[0],
         v=axes[1],
         labels=labels.reshape(grid_x.shape),
-        attractors=tuple(found),
+        attractors=tuple(found[i] for i in order),
         chaos=chaos,
         parameters=parameters,
     )
@@ -741,7 +744,7 @@ def dithered_amplitude(
     v: float | None = None,
     *,
     cycles: int = 1000,
-    transient: int = 4000,
+    transient: int = 20_000,
 ) -> float:
     """Return the amplitude under a fast exciting force less that of the fast motion itself, f/Omega^2.
 
@@ -751,7 +754,8 @@ def dithered_amplitude(
     Args:
         parameters: of the oscillator, with force_amplitude over 0.
         x, v: the start, as in :func:`poincare_section`.
-        cycles: of the force in which the extremes of x are taken, from 1 on. transient: followed before, from 0 on.
+        cycles: of the force in which the extremes of x are taken, from 1 on.
+        transient: followed before, from 0 on; near v_b1, where the vibration dies out slowly, it takes many.
 
     Raises:
         OrbitError: if the mass loses contact.

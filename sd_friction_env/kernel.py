@@ -3520,7 +3520,7 @@ def _carry_in_slip(plant, mode, x, v, v_belt, duration, vectors):
         x_2, v_2, _, _, _, _, _ = slip_step(middle, mode, x_1, v_1, v_belt, 0.0, 0.0, 0.5 * h)
         k_2, c_2 = _linearised(later(now, h), mode, x_2, v_2, v_belt)
         bend = h * (abs(k_0 - 2.0 * k_1 + k_2) + abs(c_0 - 2.0 * c_1 + c_2))
-        if not bend <= TANGENT_BEND and h > TANGENT_SMALLEST_STEP:
+        if bend > TANGENT_BEND and h > TANGENT_SMALLEST_STEP:
             h = 0.5 * h
             continue
         for i in range(len(vectors)):
@@ -3663,14 +3663,14 @@ def _renormalise(vectors, stuck):
     """Make two tangents orthonormal; return the logarithms of the length and of the height that they had."""
     dx, dv = vectors[0, 0], vectors[0, 1]
     size = math.sqrt(dx * dx + dv * dv)
-    if not size > 0.0:
+    if size == 0.0:
         vectors[0, 0], vectors[0, 1], vectors[1, 0], vectors[1, 1] = 1.0, 0.0, 0.0, 1.0
         return -math.inf, -math.inf
     dx = dx / size
     dv = dv / size
     height = abs(dx * vectors[1, 1] - dv * vectors[1, 0])
     vectors[0, 0], vectors[0, 1], vectors[1, 0], vectors[1, 1] = dx, dv, -dv, dx
-    return math.log(size), math.log(height) if height > 0.0 and not stuck else -math.inf
+    return math.log(size), -math.inf if stuck or height == 0.0 else math.log(height)
 
 
 @compiled

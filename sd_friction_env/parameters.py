@@ -116,10 +116,13 @@ class OscillatorParameters:
             "hyperbolic" (mu_s/(1 + delta |w|), w the relative velocity) or "exponential"
             (mu_k + (mu_s - mu_k) exp(-|w|/v_0), and mu_v w).
         mu_k: kinetic friction coefficient of "coulomb", least one of "exponential", in [0, mu_s] where used.
-        delta: of "hyperbolic", in [0, 1000]. v_0: of "exponential", in [0.001, 100]. mu_v: viscous part of
-            "exponential", in [0, 10].
+        delta: of "hyperbolic", in [0, 1000].
+        v_0: of "exponential", in [0.001, 100].
+        mu_v: viscous part of "exponential", in [0, 10].
         kappa: of "duffing", in [0, 10].
-        force_amplitude, ripple_amplitude: of the excitations, in [0, 100] and [0, 10]. stiffness_amplitude: in [0, 1].
+        force_amplitude: of the exciting force, in [0, 100].
+        ripple_amplitude: of the ripple on the belt's speed, in [0, 10].
+        stiffness_amplitude: of the spring's modulation, in [0, 1].
         force_frequency, ripple_frequency, stiffness_frequency: in radians per unit of time, in [0.01, 1000].
         force_phase, ripple_phase, stiffness_phase: at t = 0, in radians, in [-10, 10].
 

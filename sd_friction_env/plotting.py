@@ -228,7 +228,13 @@ def draw_bifurcation(axis: "Axes", diagram: Table) -> None:
     for way, color, size in (("up", BLACK, 1.6), ("down", VERMILION, 0.5)):
         part = diagram["direction"] == way
         if part.any():
-            style = {"linestyle": "none", "marker": ".", "markersize": size, "markeredgewidth": 0.0, "color": color}
+            style: dict[str, Any] = {
+                "linestyle": "none",
+                "marker": ".",
+                "markersize": size,
+                "markeredgewidth": 0.0,
+                "color": color,
+            }
             axis.plot(diagram["value"][part], diagram["x"][part], rasterized=True, **style)
             axis.plot([], [], linestyle="none", marker="o", markersize=2.0 + 2.0 * size, color=color, label=way)
     axis.set_ylabel("$x$ on the section")
@@ -253,7 +259,13 @@ def draw_section(axis: "Axes", section: Table) -> None:
     """Draw a stroboscopic section, :func:`sd_friction_env.forced.poincare_section`, its stuck states apart."""
     stuck = section["mode"] == 0
     for part, color, label in ((~stuck, BLUE, "slip"), (stuck, VERMILION, "stick")):
-        style = {"linestyle": "none", "marker": ".", "markersize": 2.2, "markeredgewidth": 0.0, "color": color}
+        style: dict[str, Any] = {
+            "linestyle": "none",
+            "marker": ".",
+            "markersize": 2.2,
+            "markeredgewidth": 0.0,
+            "color": color,
+        }
         axis.plot(section["x"][part], section["v"][part], rasterized=True, **style)
         axis.plot([], [], linestyle="none", marker="o", markersize=4.0, color=color, label=label)
     axis.set_xlabel("$x$")
@@ -276,7 +288,7 @@ def draw_forced_basins(axis: "Axes", found: ForcedBasins) -> None:
         found.x, found.v, found.labels, cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True
     )
     for orbit, marker in zip(found.attractors, "osD^v<>ph*" * len(found.attractors), strict=False):
-        style = {"linestyle": "none", "markersize": 5.5, "markeredgecolor": "white", "color": BLACK}
+        style: dict[str, Any] = {"linestyle": "none", "markersize": 5.5, "markeredgecolor": "white", "color": BLACK}
         axis.plot(*orbit.points.T, marker=marker, **style)
     axis.axhline(found.parameters.belt_speed, color="0.45", linewidth=0.8, linestyle=":")
     axis.set_xlim(found.x[0], found.x[-1])

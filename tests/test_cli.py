@@ -1,6 +1,7 @@
 """The program: commands, outputs, exit codes, and messages in one line."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import pytest
 
 from sd_friction_env import Table, __version__, doctor, limit_cycle, pretrained
 from sd_friction_env.cli import main, numbers
+from sd_friction_env.forced import bifurcation_diagram, lyapunov_exponent, poincare_section
 from sd_friction_env.parameters import OscillatorParameters
 from sd_friction_env.pretrained import pretrained_file
 
@@ -70,6 +72,56 @@ def test_basins_prints_fractions_and_draws_them(tmp_path, capsys):
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert sum(row["fraction"] for row in rows) == pytest.approx(1.0)
     assert plot.stat().st_size > 5000
+
+
+def test_other_laws_are_chosen_and_swept(capsys):
+    assert main(["cycle", "--friction", "coulomb", "hyperbolic", "--delta", "2", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [row["friction"] for row in rows] == ["coulomb", "hyperbolic"]
+    assert rows[1]["amplitude"] == limit_cycle(OscillatorParameters(friction="hyperbolic", delta=2.0)).amplitude
+    exponential = ["--friction", "exponential", "--geometry", "linear", "--mu-s", "1", "--mu-k", "0.5", "--v-0", "0.5"]
+    assert main(["critical", *exponential, "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    assert row["v_b1"] == pytest.approx(0.5 * math.log(10.0), abs=1e-9)
+    assert row["v_b0"] == pytest.approx(1.8366, abs=1e-4)
+    assert row["hopf"] == "subcritical"
+    assert main(["cycle", "--force-amplitude", "0.1"]) == 2
+    assert "force_amplitude = 0.1" in capsys.readouterr().err
+
+
+DRIVE = ["--force-amplitude", "0.28", "--force-frequency", "1.2", "--alpha", "0.6"]
+
+
+def test_a_forced_motion_is_seen_in_its_section_its_exponent_and_its_diagram(tmp_path, capsys):
+    parameters = OscillatorParameters(alpha=0.6, force_amplitude=0.28, force_frequency=1.2)
+    start = ["--start", "1.15", "0.2"]
+    out, plot = tmp_path / "section.csv", tmp_path / "section.png"
+    assert main(["poincare", *DRIVE, *start, "--cycles", "40", "--out", str(out), "--plot", str(plot)]) == 0
+    assert np.array_equal(Table.from_csv(out)["x"], poincare_section(parameters, 1.15, 0.2, cycles=40)["x"])
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert main(["lyapunov", *DRIVE, *start, "--cycles", "400", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    assert row["largest"] == lyapunov_exponent(parameters, 1.15, 0.2, cycles=400).largest > 0.0
+    assert main(["lyapunov", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"][0]["largest"] is None  # minus infinity: it sticks
+    out, plot = tmp_path / "diagram.csv", tmp_path / "diagram.png"
+    over = ["--over", "force-amplitude", "0.1", "0.2", "0.3", "--cycles", "20", "--direction", "both"]
+    command = ["bifurcation", *DRIVE[2:], *over, "--out", str(out), "--plot", str(plot)]
+    assert main([*command, "--folder", str(tmp_path / "kept")]) == 0
+    table, diagram = Table.from_csv(out), ["force_amplitude", [0.1, 0.2, 0.3]]
+    wanted = bifurcation_diagram(parameters, *diagram, direction="both", cycles=20)
+    assert np.array_equal(table["x"], wanted["x"])
+    assert table["direction"].tolist() == wanted["direction"].tolist()
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    for bad, said in (
+        (["mass", "1"], "name must be one of"),
+        (["force-amplitude", "x"], "'x' is no number"),
+        (["force-amplitude", "-1"], "force_amplitude must be"),
+        (["force-amplitude"], "values must"),
+    ):
+        assert main(["bifurcation", *DRIVE[2:], "--over", *bad, "--folder", str(tmp_path / "none")]) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize(

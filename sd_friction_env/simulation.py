@@ -213,7 +213,7 @@ def simulate(
         events=tuple(events),
         stick_time=stick_time,
         energy=EnergyBalance(
-            change=0.5 * v * v + kernel.energy_in_spring(kernel.later(plant, t0), x) - start_energy,
+            change=0.5 * v * v + kernel.energy_in_spring(kernel.later(plant, float(table[-1, 0])), x) - start_energy,
             damping=damping,
             contact=contact,
             control=control,

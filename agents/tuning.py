@@ -15,6 +15,7 @@ import copy
 import dataclasses
 import math
 import multiprocessing
+import os
 import signal
 import threading
 import time
@@ -593,6 +594,7 @@ def _objective(trial: Trial, search: Search, trials: int, should_stop: Callable[
     plan = search.trial_plan(values, trial_index(trial.study, number))
     trial.set_user_attr("hyperparameters", dict(plan.hyperparameters))
     trial.set_user_attr("seed", plan.seed)
+    trial.set_user_attr("process", os.getpid())
     best: dict[str, float] = {}
 
     def report(row: dict[str, float]) -> None:

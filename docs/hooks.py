@@ -137,7 +137,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill in the marks; figures lie beside the pages in the site, and beside docs/ in the repository."""
-    return expanded(markdown).replace("](../figures/", "](figures/")
+    return re.sub(r"\]\(\.\./((?:\.\./)*figures/)", r"](\1", expanded(markdown))
 
 
 def on_page_content(html: str, **_: Any) -> str:

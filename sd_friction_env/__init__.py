@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from gymnasium.envs.registration import register
 
 if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out for type checkers
-    from sd_friction_env.basins import Basins, basin_grid, basins
+    from sd_friction_env.basins import Basins, basin_grid
     from sd_friction_env.curves import amplitude_curve, attractor_curves
     from sd_friction_env.env import EnvState, SDFrictionEnv
     from sd_friction_env.orbits import (
@@ -53,7 +53,6 @@ _PUBLIC = {
     "attractor_curves": "curves",
     "Basins": "basins",
     "basin_grid": "basins",
-    "basins": "basins",
     "Table": "tables",
     "Task": "task",
     "SDFrictionEnv": "env",
@@ -80,7 +79,6 @@ __all__ = [
     "attractor_curves",
     "attractors",
     "basin_grid",
-    "basins",
     "critical_belt_speeds",
     "equilibria",
     "first_lyapunov_coefficient",

@@ -20,7 +20,6 @@ from sd_friction_env import (
     SDFrictionEnv,
     SDFrictionVectorEnv,
     attractors,
-    basins,
     critical_belt_speeds,
     equilibria,
     kernel,
@@ -29,6 +28,7 @@ from sd_friction_env import (
     stick_intervals,
     theory,
 )
+from sd_friction_env.basins import basins
 from sd_friction_env.orbits import first_lyapunov_coefficient, grazing_belt_speed, hopf_belt_speed, slip_cycles
 from sd_friction_env.parameters import FRICTIONS
 from tests import oracle

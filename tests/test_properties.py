@@ -121,6 +121,7 @@ CHANGES = {
     "start": "random",
     "randomise": {"alpha": (0.7, 0.8)},
     "show_parameters": True,
+    "show_phases": True,
     "sensor": "position",
     "sensor_noise": 0.01,
     "sensor_delay": 2,

@@ -28,6 +28,9 @@ _FEATURES = {
     "zoo": "training with RL Zoo",
     "report": "the report",
     "export": "agents as ONNX",
+    "sweep": "sweeps in several processes",
+    "dask": "sweeps on a Dask cluster",
+    "ray": "sweeps on a Ray cluster",
     "completion": "completion in the shell",
 }
 _HERE = Path(__file__).parent

@@ -376,7 +376,7 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         lost contact and the statistics depend on it. So it is looked for among those who are calling.
         """
         limits = [] if self._own_limit is None else [self._own_limit]
-        frame: FrameType | None = sys._getframe(2)
+        frame: FrameType | None = sys._getframe()
         while frame is not None:
             if frame.f_code is TimeLimit.reset.__code__ and frame.f_locals["self"].unwrapped is self:
                 limits.append(frame.f_locals["self"]._max_episode_steps)
@@ -723,7 +723,8 @@ def real_array(expected: str, values: Any) -> NDArray[Any]:
     if array.dtype.kind not in "biuf" and not objects:
         raise TypeError(f"{expected}, got {brief_repr(values)} of type {array.dtype}")
     try:
-        return array.astype(np.float64)
+        with np.errstate(over="ignore"):  # of a long double becomes infinite, which whoever asked will refuse
+            return array.astype(np.float64)
     except OverflowError:
         raise ValueError(f"{expected}, got {brief_repr(values)}") from None
 
@@ -759,5 +760,6 @@ def checked_options(options: Any) -> dict[str, Any]:
 
 
 def without_axes(value: Any) -> Any:
-    """Return a value, or the one in an array without axes: wrappers that convert arrays hand numbers over so."""
-    return value.item() if isinstance(value, np.generic | np.ndarray) and value.ndim == 0 else value
+    """Return a value, or the one in an array without axes (of any library): wrappers that convert arrays hand numbers
+    over so."""
+    return value.item() if getattr(value, "ndim", None) == 0 else value

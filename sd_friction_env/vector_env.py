@@ -547,32 +547,27 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         }
 
     def _reset_info(self, which: IntegerArray, start: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        info: dict[str, Any] = {}
         mask = self._mask(which)
-        for name, values in start.items():
-            info[name], info[f"_{name}"] = self._spread(values, which), mask
-        info["parameters"], info["_parameters"] = self._parameters_info(which, mask), mask
-        return info
-
-    def _parameters_info(self, which: IntegerArray, mask: NDArray[np.bool_]) -> dict[str, Any]:
+        info = self._spread(start, which, mask)
         geometries = self._integers[kernel.I_GEOMETRY, which]
         geometries[geometries == kernel.DISCONTINUOUS] = kernel.EXACT
         frictions = self._state[kernel.S_FRICTION, which].astype(np.int64)
-        columns = {
-            "geometry": geometries,
-            "friction": frictions,
-            **dict(zip(_NUMBERS, self._numbers[:, which], strict=True)),
-        }
-        info: dict[str, Any] = {}
-        for name, values in columns.items():
-            info[name], info[f"_{name}"] = self._spread(values, which), mask
-        return info
+        parameters = {"geometry": geometries, "friction": frictions}
+        parameters.update(zip(_NUMBERS, self._numbers[:, which], strict=True))
+        return info | {"parameters": self._spread(parameters, which, mask), "_parameters": mask}
 
-    def _spread(self, values: NDArray[Any], which: IntegerArray) -> NDArray[Any]:
-        """Return an array (num_envs,) with values (k,) in the places ``which`` and 0 elsewhere."""
-        spread = np.zeros(self.num_envs, values.dtype)
-        spread[which] = values
-        return spread
+    def _spread(
+        self, columns: Mapping[str, NDArray[Any]], which: IntegerArray, mask: NDArray[np.bool_]
+    ) -> dict[str, Any]:
+        """Return arrays (num_envs,) with the columns' values (k,) in the places ``which`` and 0 elsewhere, by name, and
+        the mask beside each."""
+        info: dict[str, Any] = dict.fromkeys((f"_{name}" for name in columns), mask)
+        for dtype in dict.fromkeys(values.dtype for values in columns.values()):  # one array for each is much faster
+            names = [name for name, values in columns.items() if values.dtype == dtype]
+            block = np.zeros((len(names), self.num_envs), dtype)
+            block[:, which] = [columns[name] for name in names]
+            info.update(zip(names, block, strict=True))
+        return info
 
     def _mask(self, which: IntegerArray) -> NDArray[np.bool_]:
         if len(which) == self.num_envs:
@@ -766,9 +761,7 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         observations = np.full(self.num_envs, None, object).view(FinalObservations)
         for i in which.tolist():
             observations[i] = self._observations[i].copy()
-        last = dict(statistics)
-        for name in self.step_keys:
-            last[name], last[f"_{name}"] = self._spread(info[name][which], which), mask
+        last = {**statistics, **self._spread({name: info[name][which] for name in self.step_keys}, which, mask)}
         return {"final_obs": observations, "_final_obs": mask, "final_info": last, "_final_info": mask}
 
     def _statistics(self, which: IntegerArray) -> dict[str, Any]:

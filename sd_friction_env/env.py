@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics, TimeLimit
 from numpy.typing import NDArray
 
 from sd_friction_env import kernel
@@ -60,6 +60,14 @@ _STEP_INFO: dict[str, Any] = {
 # Those statistics of an episode that its last info also holds by themselves, where monitors look for them; the others
 # have the names of a step's terms.
 PLAIN_STATISTICS = tuple(name for name in EPISODE_STATISTICS if name not in _STEP_INFO)
+# The steps of wrappers that step the environment once: what a limit around others counts is not the environment's.
+_STEPS_LIKE_OURS = {
+    wrapper.step
+    for wrapper in (
+        *(gym.Wrapper, gym.ActionWrapper, gym.ObservationWrapper, gym.RewardWrapper),
+        *(OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics, TimeLimit),
+    )
+}
 READOUT_INTERVALS = 100  # the window of the rendered amplitude and stick readouts
 
 
@@ -173,7 +181,7 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
 
     Terminated if the mass loses contact with the belt (N <= 0), at a cost of the steps left times the worst cost per
     step (at least `contact_loss_cost`). Truncated after `episode_steps` intervals, or if the integrator gives up
-    (`info["status"]`: event or step limit). A `TimeLimit` around the environment (`max_episode_steps` of `gym.make`)
+    (`info["status"]`: event or step limit). `max_episode_steps` of `gym.make` (a `TimeLimit` around the environment)
     takes the place of `episode_steps`; if both are given, the shorter holds.
 
     ## Arguments
@@ -378,8 +386,12 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         limits = [] if self._own_limit is None else [self._own_limit]
         frame: FrameType | None = sys._getframe()
         while frame is not None:
-            if frame.f_code is TimeLimit.reset.__code__ and frame.f_locals["self"].unwrapped is self:
-                limits.append(frame.f_locals["self"]._max_episode_steps)
+            if frame.f_code is TimeLimit.reset.__code__:
+                inner = limiter = frame.f_locals["self"]
+                while isinstance(inner, gym.Wrapper) and type(inner).step in _STEPS_LIKE_OURS:
+                    inner = inner.env
+                if inner is self:
+                    limits.append(limiter._max_episode_steps)
             frame = frame.f_back
         return min(limits, default=self.task.episode_steps)
 

@@ -79,6 +79,16 @@ def test_an_episode_is_as_long_as_the_time_limit_around_it_and_ends_with_its_sta
     assert came_to[0] == came_to[1] == came_to[2]
 
 
+def test_a_time_limit_around_a_wrapper_that_repeats_steps_counts_that_wrappers():
+    env = wrappers.TimeLimit(wrappers.RepeatAction(gym.make(BELT), 2), 5)
+    env.reset(seed=0)
+    ends = []
+    while not any(ends):
+        ends.append(env.step(np.full(1, 0.5, np.float32))[3])
+    assert ends == [False] * 4 + [True]
+    assert env.unwrapped.get_state().steps == 10
+
+
 def test_lost_contact_costs_the_steps_that_a_time_limit_leaves():
     costs = []
     for limit in ({"max_episode_steps": 30}, {"episode_steps": 30}, {}):

@@ -298,7 +298,7 @@ def soak(report: Report, steps: int) -> None:
                 fine = fine and v_rel == 0.0 and abs(load) <= limit * (1.0 + 1e-9) + 1e-12
             else:
                 fine = fine and mode * v_rel >= 0.0
-            fine = fine and info["status"] in ("ok", "contact lost")
+            fine = fine and info["status"] in (kernel.OK, kernel.CONTACT_LOST)
             faults += not fine
             lost += terminated
             if terminated or truncated:

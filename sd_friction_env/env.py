@@ -4,27 +4,34 @@ import collections
 import dataclasses
 import math
 import numbers
+import sys
 from collections.abc import Callable, Mapping
+from types import FrameType
 from typing import Any, Self, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics, TimeLimit
 from numpy.typing import NDArray
 
 from sd_friction_env import kernel
 from sd_friction_env.orbits import stick_intervals
 from sd_friction_env.parameters import (
     EXCITATIONS,
+    FRICTION_CODES,
+    GEOMETRY_CODES,
     STATE_LIMIT,
     OscillatorParameters,
+    brief_repr,
     checked_choice,
     checked_number,
 )
 from sd_friction_env.rendering import checked_size
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.startup import announced
-from sd_friction_env.task import FloatArray, IntegerArray, Task, rig_arguments
+from sd_friction_env.task import FloatArray, IntegerArray, Task, rig_arguments, steps_before_last_quarter
 
 RewardFunction = Callable[[Mapping[str, Any]], float]
 
@@ -47,9 +54,21 @@ _STEP_INFO: dict[str, Any] = {
     **dict.fromkeys(("normal_force", "time", "action", "force", "belt_acceleration", "x_min", "x_max"), 0.0),
     **dict.fromkeys(("mean_square_velocity", "stick_fraction", "friction_power", "control_power"), 0.0),
     "events": 0,
-    "status": kernel.STATUS_NAMES[kernel.OK],
+    "status": kernel.OK,
     **dict.fromkeys(("reward_vibration", "reward_effort", "reward_stick", "reward_contact_loss"), 0.0),
 }
+# Those statistics of an episode that its last info also holds by themselves, where monitors look for them; the others
+# have the names of a step's terms.
+PLAIN_STATISTICS = tuple(name for name in EPISODE_STATISTICS if name not in _STEP_INFO)
+# The steps of wrappers that step the environment once: what a limit around others counts is not the environment's.
+_STEPS_LIKE_OURS = {
+    wrapper.step
+    for wrapper in (
+        *(gym.Wrapper, gym.ActionWrapper, gym.ObservationWrapper, gym.RewardWrapper),
+        *(OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics, TimeLimit),
+    )
+}
+SMALLEST_BELT_SPEED = 1e-6  # of an environment
 READOUT_INTERVALS = 100  # the window of the rendered amplitude and stick readouts
 
 
@@ -70,7 +89,26 @@ class EnvState:
     past: tuple[tuple[float, float], ...]
 
 
-class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+class KnowsItsLength:
+    """An environment whose ``spec`` says after how many steps it truncates an episode.
+
+    ``gym.make`` and ``gym.make_vec`` write a ``spec`` that has the limits of Gymnasium's own wrappers alone.
+    """
+
+    task: Task
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How ``gym.make`` or ``gym.make_vec`` made the environment; None if they did not."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec and dataclasses.replace(spec, max_episode_steps=self.task.episode_steps)
+
+
+class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
     ## Description
 
@@ -113,7 +151,20 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     With an episode's last step `info["statistics"]` holds its `return`, its `length`, `late_amplitude` and
     `late_stick_fraction` (over the last quarter of the time an episode has; NaN if it did not come so far) and the sums
-    of the four terms.
+    of the four terms. The first four also stand in `info` itself, where monitors look for them.
+
+    ## Info
+
+    All values are numbers, so that wrappers can make tensors of them; where they stand for names:
+
+    | entry | number | name |
+    |---|---|---|
+    | `mode` | -1, 0, 1 | slips slower than the belt, sticks, slips faster than the belt |
+    | `status` | 0, 1, 2, 3 | ok, contact lost, event limit, step limit (`kernel.STATUS_NAMES`) |
+    | `parameters`: `geometry` | 0, 1, 2, 3 | exact, cubic, linear, duffing (`parameters.GEOMETRIES`) |
+    | `parameters`: `friction` | 0, 1, 2, 3 | stribeck, coulomb, hyperbolic, exponential (`parameters.FRICTIONS`) |
+
+    `env.unwrapped.parameters` are the episode's :class:`OscillatorParameters` themselves.
 
     ## Starting State
 
@@ -131,7 +182,8 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Terminated if the mass loses contact with the belt (N <= 0), at a cost of the steps left times the worst cost per
     step (at least `contact_loss_cost`). Truncated after `episode_steps` intervals, or if the integrator gives up
-    (`info["status"]`: event or step limit).
+    (`info["status"]`: event or step limit). `max_episode_steps` of `gym.make` (a `TimeLimit` around the environment)
+    takes the place of `episode_steps`; if both are given, the shorter holds.
 
     ## Arguments
 
@@ -166,6 +218,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.nominal = as_parameters(parameters)
         check_belt(self.nominal)
         task = Task.from_arguments(task_arguments)
+        self._own_limit = task.episode_steps if "episode_steps" in task_arguments else None
         if render_mode is not None:
             checked_choice("render_mode", render_mode, tuple(self.metadata["render_modes"]))
         if reward is not None and not callable(reward):
@@ -296,6 +349,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             super().reset(seed=seed)
             key, episode = int(self.np_random.integers(2**62)), 0
         task = self.task
+        limit = self._limit_of_callers()
         parameters = task.drawn_parameters(self.nominal, key, episode)
         if "parameters" in options:
             parameters = parameters.replace(**options["parameters"])
@@ -303,6 +357,8 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         with announced("starts"):
             x, v = start_of(task, parameters, options, key, episode)
         self._key = key
+        self._codes[kernel.T_EPISODE_STEPS] = limit
+        self._codes[kernel.T_LATE_STEPS] = steps_before_last_quarter(limit)
         self._use(parameters)
         self._integers[kernel.I_KEY], self._integers[kernel.I_EPISODE] = key, episode
         self._state[kernel.S_X], self._state[kernel.S_V] = x, v
@@ -319,8 +375,26 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             "mode": self._mode,
             "normal_force": normal_force,
             "time": 0.0,
-            "parameters": dataclasses.asdict(parameters),
+            "parameters": numbers_of(parameters),
         }
+
+    def _limit_of_callers(self) -> int:
+        """Return after how many steps the episode that begins is truncated.
+
+        A :class:`TimeLimit` around the environment hands every reset on but tells its limit to nobody, and the cost of
+        lost contact and the statistics depend on it. So it is looked for among those who are calling.
+        """
+        limits = [] if self._own_limit is None else [self._own_limit]
+        frame: FrameType | None = sys._getframe()
+        while frame is not None:
+            if frame.f_code is TimeLimit.reset.__code__:
+                inner = limiter = frame.f_locals["self"]
+                while isinstance(inner, gym.Wrapper) and type(inner).step in _STEPS_LIKE_OURS:
+                    inner = inner.env
+                if inner is self:
+                    limits.append(limiter._max_episode_steps)
+            frame = frame.f_back
+        return min(limits, default=self.task.episode_steps)
 
     def step(
         self, action: NDArray[np.float32]
@@ -370,7 +444,7 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         info["action"] = a
         if status != kernel.OK:
             self._running = False
-            info["status"] = kernel.STATUS_NAMES[status]
+            info["status"] = status
         if self.reward is not None:
             reward = float(self.reward(info))
             self._state[kernel.S_RETURN] += reward
@@ -382,7 +456,9 @@ class SDFrictionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if terminated or truncated:
             values = np.empty((len(EPISODE_STATISTICS), 1))
             kernel.episode_statistics(self._state, self._integers, (0,), self.reward is not None, values)
-            info["statistics"] = {name: value.item() for name, value in named_statistics(values).items()}
+            statistics = {name: value.item() for name, value in named_statistics(values).items()}
+            info["statistics"] = statistics
+            info.update((name, statistics[name]) for name in PLAIN_STATISTICS)
         return self._seen.copy(), reward, terminated, truncated, info
 
     def get_state(self) -> EnvState:
@@ -506,6 +582,12 @@ def task_arrays(task: Task) -> tuple[FloatArray, IntegerArray]:
     return numbers, codes
 
 
+def numbers_of(parameters: OscillatorParameters) -> dict[str, float]:
+    """Return parameters as info has them: geometry and friction by their places in GEOMETRIES and FRICTIONS."""
+    codes = {"geometry": GEOMETRY_CODES[parameters.geometry], "friction": FRICTION_CODES[parameters.friction]}
+    return dataclasses.asdict(parameters) | codes
+
+
 def named_statistics(values: FloatArray) -> dict[str, NDArray[Any]]:
     """Return what ``kernel.episode_statistics`` wrote (8, n) by name, each (n,)."""
     statistics: dict[str, NDArray[Any]] = dict(zip(EPISODE_STATISTICS, values, strict=True))
@@ -565,23 +647,27 @@ def checked_state(name: str, state: Any) -> None:
         if type(value) is float and math.isfinite(value):  # as a rule, and the quickest to ask
             continue
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
-            raise TypeError(f"{name}.{field} must be a real number, got {value!r}")
-        if not (math.isfinite(value) or state.ended):
-            raise ValueError(f"{name}.{field} must be finite, got {value!r}")
+            raise TypeError(f"{name}.{field} must be a real number, got {brief_repr(value)}")
+        try:
+            legal = math.isfinite(value) or state.ended
+        except OverflowError:
+            legal = False
+        if not legal:
+            raise ValueError(f"{name}.{field} must be finite, got {brief_repr(value)}")
     for field in ("steps", "key", "episode"):
         value = getattr(state, field)
         if isinstance(value, bool) or not isinstance(value, int | np.integer):
-            raise TypeError(f"{name}.{field} must be a whole number, got {value!r}")
+            raise TypeError(f"{name}.{field} must be a whole number, got {brief_repr(value)}")
         if not 0 <= value < 2**63:
-            raise ValueError(f"{name}.{field} must be in [0, 2**63), got {value!r}")
+            raise ValueError(f"{name}.{field} must be in [0, 2**63), got {brief_repr(value)}")
     if state.past == ():
         return
     try:
         shape = np.asarray(state.past, np.float64).shape
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         shape = ()
     if len(shape) != 2 or shape[1] != 2:
-        raise TypeError(f"{name}.past must be a tuple of pairs (x, v) of numbers, got {state.past!r}")
+        raise TypeError(f"{name}.past must be a tuple of pairs (x, v) of numbers, got {brief_repr(state.past)}")
 
 
 def as_parameters(parameters: Any) -> OscillatorParameters:
@@ -602,9 +688,9 @@ def _check_names(name: str, parameters: Mapping[Any, Any]) -> None:
 
 
 def check_belt(parameters: OscillatorParameters) -> None:
-    if parameters.belt_speed <= 0.0:
+    if parameters.belt_speed < SMALLEST_BELT_SPEED:
         raise ValueError(
-            f"belt_speed must be positive in an environment (its reward is measured against it), "
+            f"belt_speed must be at least {SMALLEST_BELT_SPEED:g} in an environment, for its reward is relative to it, "
             f"got {parameters.belt_speed!r}"
         )
 
@@ -627,9 +713,9 @@ def _clipped_action(action: Any) -> float:
     expected = "action must be one finite number in an array of shape (1,)"
     array = real_array(expected, action)
     if array.shape != (1,):
-        raise ValueError(f"{expected}, got shape {array.shape}: {action!r}")
+        raise ValueError(f"{expected}, got shape {array.shape}: {brief_repr(action)}")
     if not np.isfinite(array[0]):
-        raise ValueError(f"{expected}; outside [-1, 1] it is clipped; got {action!r}")
+        raise ValueError(f"{expected}; outside [-1, 1] it is clipped; got {brief_repr(action)}")
     return float(min(max(array[0], -1.0), 1.0))
 
 
@@ -638,18 +724,22 @@ def real_array(expected: str, values: Any) -> NDArray[Any]:
 
     Raises:
         TypeError: if they are no real numbers (text, complex numbers and times are none), or no array can be made of
-            them; its message begins with what is ``expected``.
+            them. ValueError: if one is beyond the greatest float. The message begins with what is ``expected``.
     """
     try:
         array = np.asarray(values)
     except (RuntimeError, TypeError, ValueError) as error:  # RuntimeError: of a tensor that requires a gradient
-        raise TypeError(f"{expected}, got {values!r} ({error})") from None
+        raise TypeError(f"{expected}, got {brief_repr(values)} ({error})") from None
     if array.dtype in (np.float32, np.float64):
         return array
     objects = array.dtype == object and all(isinstance(value, numbers.Real) for value in array.flat)
     if array.dtype.kind not in "biuf" and not objects:
-        raise TypeError(f"{expected}, got {values!r} of type {array.dtype}")
-    return array.astype(np.float64)
+        raise TypeError(f"{expected}, got {brief_repr(values)} of type {array.dtype}")
+    try:
+        with np.errstate(over="ignore"):  # of a long double becomes infinite, which whoever asked will refuse
+            return array.astype(np.float64)
+    except OverflowError:
+        raise ValueError(f"{expected}, got {brief_repr(values)}") from None
 
 
 def checked_options(options: Any) -> dict[str, Any]:
@@ -660,7 +750,7 @@ def checked_options(options: Any) -> dict[str, Any]:
     unknown = sorted(str(name) for name in options if name not in OPTIONS)
     if unknown:
         raise ValueError(f"unknown option {unknown[0]!r}; allowed: {', '.join(OPTIONS)}")
-    checked = dict(options)
+    checked = {name: without_axes(value) for name, value in options.items()}
     if "parameters" in checked:
         given = checked["parameters"]
         if isinstance(given, OscillatorParameters):
@@ -669,6 +759,7 @@ def checked_options(options: Any) -> dict[str, Any]:
             raise TypeError(f"options['parameters'] must map parameter names to values, got {given!r}")
         else:
             _check_names("options['parameters']", given)
+            checked["parameters"] = {name: without_axes(value) for name, value in given.items()}
     for name in ("x", "v"):
         if name in checked:
             checked[name] = checked_number(f"options[{name!r}]", checked[name], -STATE_LIMIT, STATE_LIMIT)
@@ -679,3 +770,9 @@ def checked_options(options: Any) -> dict[str, Any]:
     if sum(name in checked for name in ("x", "phase", "start")) > 1:
         raise ValueError(f"options 'x', 'phase' and 'start' exclude one another, got {dict(options)!r}")
     return checked
+
+
+def without_axes(value: Any) -> Any:
+    """Return a value, or the one in an array without axes (of any library): wrappers that convert arrays hand numbers
+    over so."""
+    return value.item() if getattr(value, "ndim", None) == 0 else value

@@ -70,11 +70,39 @@ def checked_number(name: str, value: Any, low: float, high: float) -> float:
         ValueError: if it is not finite or not in [low, high].
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise TypeError(f"{name} must be a real number in [{low:g}, {high:g}], got {value!r} ({type(value).__name__})")
-    number = float(value)
+        kind = type(value).__name__
+        raise TypeError(f"{name} must be a real number in [{low:g}, {high:g}], got {brief_repr(value)} ({kind})")
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number or a fraction beyond the greatest float
+        raise ValueError(f"{name} must be a finite number in [{low:g}, {high:g}], got {brief_repr(value)}") from None
     if not low <= number <= high:  # refuses NaN too
         raise ValueError(f"{name} must be a finite number in [{low:g}, {high:g}], got {number!r}")
     return number
+
+
+def checked_count(name: str, value: Any, low: int, high: int) -> int:
+    """Return ``value`` as an int.
+
+    Raises:
+        TypeError: if it is not a real number. ValueError: if it is not whole or not in [low, high].
+    """
+    number = checked_number(name, value, low, high)
+    if number != int(number):
+        raise ValueError(f"{name} must be a whole number in [{low}, {high}], got {brief_repr(value)}")
+    return int(number)
+
+
+def brief_repr(value: Any) -> str:
+    """Return ``repr(value)`` for an error message, shortened where it is long.
+
+    Whole numbers have no greatest: Python refuses to write one of more than 4,300 digits.
+    """
+    try:
+        text = repr(value)
+    except ValueError:
+        return f"a value of type {type(value).__name__} with too many digits to be written"
+    return text if len(text) <= 300 else f"{text[:100]}... ({len(text)} characters)"
 
 
 def checked_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
@@ -84,7 +112,7 @@ def checked_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
         ValueError: if it is not.
     """
     if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {brief_repr(value)}")
     return str(value)
 
 

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from sd_friction_env.parameters import brief_repr
+
 if TYPE_CHECKING:
     import pygame
 
@@ -287,7 +289,7 @@ def _checked_whole(name: str, value: Any, limits: tuple[int, int]) -> int:
     except TypeError:
         number = -1
     if not low <= number <= high:
-        raise ValueError(f"{name} must be a whole number in [{low}, {high}], got {value!r}")
+        raise ValueError(f"{name} must be a whole number in [{low}, {high}], got {brief_repr(value)}")
     return number
 
 

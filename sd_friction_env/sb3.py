@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
+from sd_friction_env.env import PLAIN_STATISTICS
 from sd_friction_env.vector_env import RESET_KEYS, SDFrictionVectorEnv, checked_info_keys
 
 _ENTRY_POINT = f"{SDFrictionVectorEnv.__module__}:{SDFrictionVectorEnv.__name__}"
@@ -22,7 +23,9 @@ class SDFrictionVecEnv(VecEnv):
     Environment i does bit for bit what ``gym.make(env_id)`` does in a ``DummyVecEnv`` with the same seed, and the
     whole batch takes about as long as a few of those. An episode's last ``info`` holds ``terminal_observation``,
     ``TimeLimit.truncated``, ``episode`` (return "r", length "l" and seconds since the start "t", as ``Monitor`` has
-    them, so no ``VecMonitor`` is needed) and ``statistics`` (see :class:`SDFrictionEnv`).
+    them, so no ``VecMonitor`` is needed) and ``statistics``, the first four of them also by themselves (see
+    :class:`SDFrictionEnv`). Methods take ``indices`` as ``DummyVecEnv`` does: None, whole numbers, negative ones from
+    the end.
 
     Args:
         env_id: such as "SDFriction/Force-v0".
@@ -123,11 +126,12 @@ class SDFrictionVecEnv(VecEnv):
         names = [name for name in statistics if not name.startswith("_")]
         last = _rows(final, self._info_keys, self.num_envs, which)
         for i, values, single in zip(which, _rows(statistics, names, self.num_envs, which), last, strict=True):
-            self.reset_infos[i] = _single_infos(info, self.num_envs, [i])[0] if "parameters" in info else {}
+            self.reset_infos[i] = _single_infos(info, self.num_envs, [i])[0]
             infos[i] = single
             single["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
             single["terminal_observation"] = info["final_obs"][i]
             single["statistics"] = values
+            single.update((name, values[name]) for name in PLAIN_STATISTICS)
             single["episode"] = {"r": round(values["return"], 6), "l": values["length"], "t": seconds}
 
     def close(self) -> None:
@@ -136,7 +140,7 @@ class SDFrictionVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Return an attribute of environments; see :meth:`SDFrictionVectorEnv.attributes_at`."""
-        return self.envs.attributes_at(self._get_indices(indices), attr_name)
+        return self.envs.attributes_at(indices, attr_name)
 
     def has_attr(self, attr_name: str) -> bool:
         """Whether the environments, which are all of one kind, have an attribute of that name."""
@@ -148,19 +152,19 @@ class SDFrictionVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Set an attribute of environments; see :meth:`SDFrictionVectorEnv.set_attr`."""
-        self.envs.set_attr_at(self._get_indices(indices), attr_name, value)
+        self.envs.set_attr_at(indices, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of environments; see :meth:`SDFrictionVectorEnv.call`."""
-        return self.envs.call_at(self._get_indices(indices), method_name, *method_args, **method_kwargs)
+        return self.envs.call_at(indices, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: int | Iterable[int] | None = None
     ) -> list[bool]:
         """Whether environments are wrapped: in nothing, but they keep the statistics that ``Monitor`` keeps."""
-        return [issubclass(wrapper_class, Monitor)] * len(list(self._get_indices(indices)))
+        return [issubclass(wrapper_class, Monitor)] * len(self.envs.places(indices))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Return a picture (height, width, 3) of each environment that is drawn."""

@@ -18,6 +18,7 @@ from sd_friction_env.parameters import (
     STATE_LIMIT,
     OscillatorParameters,
     checked_choice,
+    checked_count,
     checked_number,
 )
 
@@ -48,7 +49,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "contact_loss_cost": (0.0, 1e6),
     "observation_limit": (1e-3, 1e6),
 }
-_COUNTS: dict[str, tuple[int, int]] = {"episode_steps": (1, 10**9), "sensor_delay": (0, 1000)}
+EPISODE_STEPS = (1, 10**9)
+_COUNTS: dict[str, tuple[int, int]] = {"episode_steps": EPISODE_STEPS, "sensor_delay": (0, 1000)}
 _SCALES: dict[str, tuple[float, float]] = {"x_offset": (-1e12, 1e12), "x_scale": (1e-9, 1e12), "v_scale": (1e-9, 1e12)}
 
 
@@ -116,10 +118,7 @@ class Task:
         for name, (low, high) in _RANGES.items():
             object.__setattr__(self, name, checked_number(name, getattr(self, name), low, high))
         for name, (first, last) in _COUNTS.items():
-            value = checked_number(name, getattr(self, name), first, last)
-            if value != int(value):
-                raise ValueError(f"{name} must be a whole number in [{first}, {last}], got {value!r}")
-            object.__setattr__(self, name, int(value))
+            object.__setattr__(self, name, checked_count(name, getattr(self, name), first, last))
         for name, (low, high) in _SCALES.items():
             value = getattr(self, name)
             if value is not None:
@@ -143,7 +142,9 @@ class Task:
         """
         unknown = sorted(set(arguments) - set(cls.field_names()))
         if unknown:
-            raise TypeError(f"unknown argument {unknown[0]!r}; allowed: {', '.join(cls.field_names())}")
+            # Python's own words: by these, clients that try an argument know that there is no such argument.
+            allowed = ", ".join(cls.field_names())
+            raise TypeError(f"__init__() got an unexpected keyword argument {unknown[0]!r}; allowed: {allowed}")
         return cls(**arguments)
 
     @property
@@ -154,7 +155,7 @@ class Task:
     @property
     def late_steps(self) -> int:
         """Steps before the last quarter of an episode."""
-        return self.episode_steps - max(1, self.episode_steps // 4)
+        return steps_before_last_quarter(self.episode_steps)
 
     def with_scales(self, nominal: OscillatorParameters) -> Self:
         """Return the task with the observation scales that were left open taken from the nominal plant's unexcited
@@ -242,6 +243,11 @@ class Task:
         if cycle.amplitude == 0.0:
             return cycle.x_phase0, self.kick
         return cycle.state(phase)
+
+
+def steps_before_last_quarter(episode_steps: int) -> int:
+    """Return how many of an episode's steps come before its last quarter."""
+    return episode_steps - max(1, episode_steps // 4)
 
 
 def _checked_randomisation(randomise: Any) -> dict[str, tuple[float, float]]:

@@ -3,10 +3,14 @@
 import copy as copying
 import functools
 import inspect
+import multiprocessing
+import operator
+import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
+import numba
 import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -16,7 +20,9 @@ from numpy.typing import NDArray
 from sd_friction_env import kernel
 from sd_friction_env.env import (
     EPISODE_STATISTICS,
+    PLAIN_STATISTICS,
     EnvState,
+    KnowsItsLength,
     RewardFunction,
     SDFrictionEnv,
     check_belt,
@@ -27,6 +33,7 @@ from sd_friction_env.env import (
     real_array,
     start_of,
     task_arrays,
+    without_axes,
     write_state,
 )
 from sd_friction_env.orbits import rest_place
@@ -37,12 +44,13 @@ from sd_friction_env.parameters import (
     GEOMETRIES,
     RANGES,
     OscillatorParameters,
+    brief_repr,
     checked_choice,
-    checked_number,
+    checked_count,
     law_numbers,
 )
 from sd_friction_env.startup import announced
-from sd_friction_env.task import PHASE_SLOT, FloatArray, IntegerArray, passive_motion
+from sd_friction_env.task import EPISODE_STEPS, PHASE_SLOT, FloatArray, IntegerArray, passive_motion
 from sd_friction_env.theory import stribeck_coefficients
 
 _MOST_ENVS = 2**24
@@ -76,7 +84,6 @@ _CODES = {"mode": kernel.C_MODE, "events": kernel.C_EVENTS}
 _STEP_KEYS = (*_REPORT, *_CODES, "status")
 RESET_KEYS = ("x", "v", "v_belt", "v_rel", "mode", "normal_force", "time")
 INFO_KEYS = (*_STEP_KEYS, "parameters")
-_STATUS_NAMES = np.array([kernel.STATUS_NAMES[code] for code in sorted(kernel.STATUS_NAMES)], object)
 _NUMBERS = tuple(RANGES)  # the numeric fields of OscillatorParameters
 _STATE_ROWS = {
     "alpha": kernel.S_ALPHA,
@@ -86,8 +93,7 @@ _STATE_ROWS = {
     "belt_speed": kernel.S_BELT_SPEED,
     **{name: kernel.S_MU_K + i for i, name in enumerate(law_numbers("exponential"))},
 }
-_GEOMETRIES = np.array([*GEOMETRIES, "exact"], object)  # by the kernel's numbers: the last has alpha = 0
-_FRICTIONS = np.array(FRICTIONS, object)
+_GEOMETRIES = (*GEOMETRIES, "exact")  # by the kernel's numbers: the last has alpha = 0
 _AMPLITUDES = [_STATE_ROWS[f"{kind}_amplitude"] for kind in EXCITATIONS]
 _STATE_METHODS = ("reset", "set_state", "step")  # of the single environment
 
@@ -122,7 +128,43 @@ class _Starts(NamedTuple):
     beyond: bool  # whether any has laws beyond the paper's
 
 
-class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+class FinalObservations(np.ndarray[Any, np.dtype[Any]]):
+    """Last observations of episodes, as Gymnasium's vector environments have them: an array (num_envs,) of arrays, None
+    where no episode has ended. Other libraries take it as a tensor (num_envs, size), 0 where it has None."""
+
+    def __dlpack__(self, **kwargs: Any) -> Any:
+        rows = [row for row in self if row is not None] if self.dtype == object else []
+        if not rows:
+            return super().__dlpack__(**kwargs)
+        whole = np.zeros((len(self), *rows[0].shape), rows[0].dtype)
+        whole[[row is not None for row in self]] = rows
+        return whole.__dlpack__(**kwargs)
+
+
+def _has_threads() -> bool:
+    """Return whether numba's threads have been started, by this package or by any other user of numba."""
+    try:
+        numba.threading_layer()  # type: ignore[attr-defined]
+    except ValueError:
+        return False
+    return True
+
+
+# Threads do not survive a fork, and most of numba's threading layers end a forked process that uses them. Where they
+# may have been started before the fork, this process never uses them.
+_threads_are_lost = multiprocessing.parent_process() is not None and _has_threads()
+
+
+def _note_fork() -> None:
+    global _threads_are_lost  # noqa: PLW0603
+    _threads_are_lost = _threads_are_lost or _has_threads()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
+    os.register_at_fork(after_in_child=_note_fork)
+
+
+class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
     """
     ## Description
 
@@ -152,8 +194,9 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     A dictionary of arrays as Gymnasium's own vector environments have it: beside each array "name" stands a mask
     "_name" (all masks that are true throughout are one read-only array). ``reset`` tells everything; a step tells the
     ``info_keys``, by default the reward's terms, for at this speed all else costs more than it is worth
-    to most: ``info_keys="all"`` tells what the single environment tells. When episodes end, ``statistics`` holds their
-    return, length, late amplitude and so on (see :class:`SDFrictionEnv`).
+    to most: ``info_keys="all"`` tells what the single environment tells. Of environments that are reset within a step
+    it tells what ``reset`` tells. When episodes end, ``statistics`` holds their return, length, late amplitude and so
+    on, and the first four also stand beside it. All values are numbers (see :class:`SDFrictionEnv`).
 
     ## Arguments
 
@@ -162,10 +205,12 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         once per environment and step: slow; an array expression of ``info`` in a vector wrapper is not.
     autoreset_mode: "NextStep" (the default), "SameStep" or "Disabled" (https://farama.org/Vector-Autoreset-Mode).
     threads: how many threads may share a step, in [1, 256]; batches of fewer than 512 environments per thread use
-        fewer. More than 1 pays where that many cores are idle.
+        fewer. More than 1 pays where that many cores are idle. A process that is forked after threads have run steps
+        on one (start processes by "spawn" or "forkserver" to have threads in them).
+    max_episode_steps: as of ``gym.make``: takes the place of ``episode_steps``; if both are given, the shorter holds.
+        None or -1: no limit of its own.
     copy: True hands out new arrays at every step. False: they are overwritten by the next step (a little faster).
-    info_keys: "all", or which names of the single environment's info a step tells; "parameters" among them tells the
-        parameters of episodes that begin.
+    info_keys: "all", or which names of the single environment's info a step tells.
     render_mode: "rgb_array" (:meth:`render` returns a tuple of frames) or "human" (a window for one environment).
     render_size: of a frame, as of :class:`SDFrictionEnv`.
     render_envs: which environments are drawn; None: the first 16 (of "human": the first).
@@ -189,13 +234,12 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         render_envs: Iterable[int] | None = None,
         reward: RewardFunction | None = None,
         info_keys: Collection[str] | Literal["all"] = REWARD_TERMS,
+        max_episode_steps: int | None = None,
         **task_arguments: Any,
     ) -> None:
         super().__init__()
-        if "max_episode_steps" in task_arguments:
-            raise TypeError("max_episode_steps is no argument of a batch of these environments: use episode_steps")
-        n = self.num_envs = _whole("num_envs", num_envs, 1, _MOST_ENVS)
-        self.threads = _whole("threads", threads, 1, _MOST_THREADS)
+        n = self.num_envs = checked_count("num_envs", num_envs, 1, _MOST_ENVS)
+        self.threads = checked_count("threads", threads, 1, _MOST_THREADS)
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -204,6 +248,10 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         if not isinstance(copy, bool):
             raise TypeError(f"copy must be True or False, got {copy!r}")
         self.copy = copy
+        if max_episode_steps not in (None, -1):
+            limit = checked_count("max_episode_steps", max_episode_steps, *EPISODE_STEPS)
+            own = task_arguments.get("episode_steps", limit)
+            task_arguments["episode_steps"] = min(checked_count("episode_steps", own, *EPISODE_STEPS), limit)
         self._single = SDFrictionEnv(
             parameters, render_mode=render_mode, render_size=render_size, reward=reward, **task_arguments
         )
@@ -270,24 +318,20 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         """Make what a copy has to make anew: compiled code, and arrays that cannot be written to."""
         self._choose_stepper()
         self._kept: _Buffers | None = None
-        # What holds for all is one array for all steps.
-        self._all = np.ones(self.num_envs, np.bool_)
-        self._all_ok = np.full(self.num_envs, kernel.STATUS_NAMES[kernel.OK], object)
-        for shared in (self._all, self._all_ok):
-            shared.setflags(write=False)
+        self._all = np.ones(self.num_envs, np.bool_)  # what holds for all is one array for all steps
+        self._all.setflags(write=False)
         self._masks = {f"_{name}": self._all for name in self.step_keys}
 
     def _choose_stepper(self) -> None:
-        alone = len(self._works) == 1
         if self._beyond or self.nominal.beyond:
-            self._stepper = kernel.step_beyond if alone else kernel.step_beyond_in_threads
+            self._stepper, self._stepper_in_threads = kernel.step_beyond, kernel.step_beyond_in_threads
         else:
-            steppers = kernel.STEPPERS if alone else kernel.STEPPERS_IN_THREADS
-            self._stepper = steppers[self.nominal.geometry_code]
+            self._stepper = kernel.STEPPERS[self.nominal.geometry_code]
+            self._stepper_in_threads = kernel.STEPPERS_IN_THREADS[self.nominal.geometry_code]
         self._is_warm = False
 
     def __getstate__(self) -> dict[str, Any]:
-        anew = ("_stepper", "_is_warm", "_kept", "_all", "_all_ok", "_masks")
+        anew = ("_stepper", "_stepper_in_threads", "_is_warm", "_kept", "_all", "_masks")
         return {name: value for name, value in vars(self).items() if name not in anew}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -378,7 +422,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     def _as_parameters(self, numbers: FloatArray, kinds: IntegerArray) -> OscillatorParameters:
         values = dict(zip(_NUMBERS, numbers.tolist(), strict=True))
         geometry, friction = kinds.tolist()
-        return self.nominal.replace(geometry=_GEOMETRIES[geometry], friction=_FRICTIONS[friction], **values)
+        return self.nominal.replace(geometry=_GEOMETRIES[geometry], friction=FRICTIONS[friction], **values)
 
     def _prepared(
         self,
@@ -503,27 +547,27 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         }
 
     def _reset_info(self, which: IntegerArray, start: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        info: dict[str, Any] = {}
         mask = self._mask(which)
-        for name, values in start.items():
-            info[name], info[f"_{name}"] = self._spread(values, which), mask
-        info["parameters"], info["_parameters"] = self._parameters_info(which, mask), mask
-        return info
+        info = self._spread(start, which, mask)
+        geometries = self._integers[kernel.I_GEOMETRY, which]
+        geometries[geometries == kernel.DISCONTINUOUS] = kernel.EXACT
+        frictions = self._state[kernel.S_FRICTION, which].astype(np.int64)
+        parameters = {"geometry": geometries, "friction": frictions}
+        parameters.update(zip(_NUMBERS, self._numbers[:, which], strict=True))
+        return info | {"parameters": self._spread(parameters, which, mask), "_parameters": mask}
 
-    def _parameters_info(self, which: IntegerArray, mask: NDArray[np.bool_]) -> dict[str, Any]:
-        geometries, frictions = np.full((2, self.num_envs), None, object)
-        geometries[which] = _GEOMETRIES[self._integers[kernel.I_GEOMETRY, which]]
-        frictions[which] = _FRICTIONS[self._state[kernel.S_FRICTION, which].astype(np.int64)]
-        info: dict[str, Any] = {"geometry": geometries, "_geometry": mask, "friction": frictions, "_friction": mask}
-        for row, name in enumerate(_NUMBERS):
-            info[name], info[f"_{name}"] = self._spread(self._numbers[row, which], which), mask
+    def _spread(
+        self, columns: Mapping[str, NDArray[Any]], which: IntegerArray, mask: NDArray[np.bool_]
+    ) -> dict[str, Any]:
+        """Return arrays (num_envs,) with the columns' values (k,) in the places ``which`` and 0 elsewhere, by name, and
+        the mask beside each."""
+        info: dict[str, Any] = dict.fromkeys((f"_{name}" for name in columns), mask)
+        for dtype in dict.fromkeys(values.dtype for values in columns.values()):  # one array for each is much faster
+            names = [name for name, values in columns.items() if values.dtype == dtype]
+            block = np.zeros((len(names), self.num_envs), dtype)
+            block[:, which] = [columns[name] for name in names]
+            info.update(zip(names, block, strict=True))
         return info
-
-    def _spread(self, values: NDArray[Any], which: IntegerArray) -> NDArray[Any]:
-        """Return an array (num_envs,) with values (k,) in the places ``which`` and 0 elsewhere."""
-        spread = np.zeros(self.num_envs, values.dtype)
-        spread[which] = values
-        return spread
 
     def _mask(self, which: IntegerArray) -> NDArray[np.bool_]:
         if len(which) == self.num_envs:
@@ -563,7 +607,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         out = self._buffers()
         ended = self._advance(forces, out)
         terminated, truncated = out.over
-        said = self._said(out, ended)
+        said = self._said(out)
         if self.reward is not None:
             self._replace_rewards(said, resting, out.rewards)
         if self._views:
@@ -579,22 +623,23 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         if ended or len(resting):
             over = np.flatnonzero(terminated | truncated)
             if len(over):
-                info["statistics"], info["_statistics"] = self._statistics(over)
+                statistics = self._statistics(over)
                 if self.autoreset_mode == AutoresetMode.SAME_STEP:
-                    final = self._final(info, over)
-                    del info["statistics"], info["_statistics"]
+                    final = self._final(info, over, statistics)
                     self._over = over  # unless they can be restarted
                     self._restart(over, self._next_starts(over))
                     self._show_restarted(info, over)
                     info.update(final)
                     over = over[:0]
+                else:
+                    info.update(statistics)
             self._over = over
         if self.render_mode == "human":
             self.render()
         observations = self._observations.copy() if self.copy else self._observations
         return observations, out.rewards, terminated, truncated, info
 
-    def _said(self, out: _Buffers, ended: int) -> dict[str, Any]:
+    def _said(self, out: _Buffers) -> dict[str, Any]:
         """Return what was reported of the step, by name, each (num_envs,)."""
         n = self.num_envs
         said: dict[str, Any] = dict(zip(self._reported, out.report[:, :n], strict=True))
@@ -602,11 +647,7 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             for name, row in _CODES.items():
                 said[name] = out.codes[row, :n]
         if self._status_wanted:
-            said["status"] = self._all_ok
-        if ended and self._status_wanted:
-            status = self._integers[kernel.I_STATUS, :n]
-            if status.any():
-                said["status"] = _STATUS_NAMES[status]
+            said["status"] = self._integers[kernel.I_STATUS, :n].copy()
         return said
 
     def _checked_actions(self, actions: Any) -> FloatArray:
@@ -653,10 +694,10 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             with announced("step of a batch"):
                 self._is_warm = True
                 return self._advance(actions, out)
-        if len(self._works) == 1:
+        if len(self._works) == 1 or _threads_are_lost:
             ended: int = self._stepper(self._works[0], 0, self.num_envs, *arguments)
             return ended
-        self._stepper(self._works, self._bounds, self._ended, *arguments)
+        self._stepper_in_threads(self._works, self._bounds, self._ended, *arguments)
         return int(self._ended.sum())
 
     def _replace_rewards(self, said: Mapping[str, Any], resting: IntegerArray, rewards: FloatArray) -> None:
@@ -700,53 +741,39 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self._clear_pictures(which)
 
     def _show_restarted(self, info: dict[str, Any], which: IntegerArray) -> None:
-        """Let info say of environments that they have been reset."""
-        mask = self._mask(which)
-        stepped = ~mask
-        nobody_stepped = len(which) == self.num_envs
-        tells_start = False
+        """Let info say of environments what a reset says, in place of what it said of a step."""
+        start = self._reset_info(which, self._at_start(which))
+        stepped = ~self._mask(which)
         for name in self.step_keys:
             if name in RESET_KEYS:
-                tells_start = True
-            elif nobody_stepped:
+                info[name][which] = start.pop(name)[which]
+                del start[f"_{name}"]
+            elif len(which) == self.num_envs:
                 del info[name], info[f"_{name}"]
             else:
-                if name == "status":
-                    info[name] = info[name].copy()
-                info[name][which] = None if name == "status" else 0
+                info[name][which] = 0
                 info[f"_{name}"] = stepped
-        if tells_start:
-            for name, start in self._at_start(which).items():
-                if name in self.info_keys:
-                    info[name][which] = start
-        if "parameters" in self.info_keys:
-            info["parameters"], info["_parameters"] = self._parameters_info(which, mask), mask
+        info.update(start)
 
-    def _final(self, info: Mapping[str, Any], which: IntegerArray) -> dict[str, Any]:
+    def _final(self, info: Mapping[str, Any], which: IntegerArray, statistics: Mapping[str, Any]) -> dict[str, Any]:
         """Return the last observations and the info of environments that are about to be reset in the same step."""
         mask = self._mask(which)
-        observations = np.full(self.num_envs, None, object)
+        observations = np.full(self.num_envs, None, object).view(FinalObservations)
         for i in which.tolist():
             observations[i] = self._observations[i].copy()
-        last: dict[str, Any] = {"statistics": info["statistics"], "_statistics": mask}
-        for name in self.step_keys:
-            last[f"_{name}"] = mask
-            if name == "status":
-                last[name] = np.full(self.num_envs, None, object)
-                last[name][which] = info[name][which]
-            else:
-                last[name] = self._spread(info[name][which], which)
+        last = {**statistics, **self._spread({name: info[name][which] for name in self.step_keys}, which, mask)}
         return {"final_obs": observations, "_final_obs": mask, "final_info": last, "_final_info": mask}
 
-    def _statistics(self, which: IntegerArray) -> tuple[dict[str, Any], NDArray[np.bool_]]:
-        """Return what the episodes of environments came to."""
+    def _statistics(self, which: IntegerArray) -> dict[str, Any]:
+        """Return what info says of the episodes of environments that have ended."""
         values = np.zeros((len(EPISODE_STATISTICS), self.num_envs))
         kernel.episode_statistics(self._state, self._integers, which, self.reward is not None, values)
         mask = self._mask(which)
         statistics: dict[str, Any] = {}
         for name, entries in named_statistics(values).items():
             statistics[name], statistics[f"_{name}"] = entries, mask
-        return statistics, mask
+        plain = {name: statistics[name] for short in PLAIN_STATISTICS for name in (short, f"_{short}")}
+        return {"statistics": statistics, "_statistics": mask, **plain}
 
     def stagger(self) -> None:
         """Cut the running episodes short, each by another share, so that they do not all end in the same step.
@@ -828,9 +855,35 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         """
         return tuple(self.call_at(range(self.num_envs), name, *args, **kwargs))
 
-    def call_at(self, indices: Iterable[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
-        """:meth:`call` for some of the environments."""
-        return [self._call_one(name, i, *args, **kwargs) for i in indices]
+    def call_at(self, indices: int | Iterable[int] | None, name: str, *args: Any, **kwargs: Any) -> list[Any]:
+        """:meth:`call` for some of the environments; ``indices`` as :meth:`places` takes them."""
+        return [self._call_one(name, i, *args, **kwargs) for i in self.places(indices)]
+
+    def places(self, indices: int | Iterable[int] | None) -> list[int]:
+        """Return the places in the batch that ``indices`` name.
+
+        Args:
+            indices: one or several whole numbers in [-num_envs, num_envs), negative ones from the end as in a list;
+                None: all.
+
+        Raises:
+            TypeError: if one is not a whole number. IndexError: if there is no such environment.
+        """
+        if indices is None:
+            return self._everyone.tolist()
+        several: Any = indices if isinstance(indices, Iterable) and getattr(indices, "ndim", 1) > 0 else [indices]
+        places = []
+        for index in several:
+            try:
+                places.append(range(self.num_envs)[operator.index(index)])
+            except TypeError:
+                raise TypeError(
+                    f"indices must be None, a whole number or several of them, got {brief_repr(index)}"
+                ) from None
+            except IndexError:
+                n = self.num_envs
+                raise IndexError(f"indices must be in [{-n}, {n - 1}], got {brief_repr(index)}") from None
+        return places
 
     def _call_one(self, name: str, i: int, /, *args: Any, **kwargs: Any) -> Any:
         if name == "render":
@@ -859,14 +912,15 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             self._single.set_state(self._state_of(i))
         return getattr(self._single, name)
 
-    def attributes_at(self, indices: Iterable[int], name: str) -> list[Any]:
-        """Return an attribute of some of the environments; nothing is called: a method is one that acts on its own.
+    def attributes_at(self, indices: int | Iterable[int] | None, name: str) -> list[Any]:
+        """Return an attribute of some of the environments (``indices`` as :meth:`places` takes them); nothing is
+        called: a method is one that acts on its own.
 
         Raises:
             AttributeError: if an environment has nothing of that name.
         """
         found = []
-        for i in indices:
+        for i in self.places(indices):
             value = self._attribute(name, i)
             own = inspect.ismethod(value) and value.__self__ is self._single
             found.append(functools.partial(self._call_one, name, i) if own else value)
@@ -890,14 +944,16 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         for i, value in enumerate(listed):
             self.set_attr_at([i], name, value)
 
-    def set_attr_at(self, indices: Iterable[int], name: str, value: Any) -> None:
-        """Set an attribute of some of the environments (None for the others, if it is new) to one value."""
+    def set_attr_at(self, indices: int | Iterable[int] | None, name: str, value: Any) -> None:
+        """Set an attribute of some of the environments (None for the others, if it is new) to one value; ``indices`` as
+        :meth:`places` takes them."""
+        places = self.places(indices)
         if hasattr(self._single, name):
             raise AttributeError(
                 f"{name!r} cannot be set: parameters and tasks are given to the constructor or to reset(options=...)"
             )
         values = self._attributes.setdefault(name, [None] * self.num_envs)
-        for i in indices:
+        for i in places:
             values[i] = value
 
     # Pictures ---------------------------------------------------------------------------------------------------------
@@ -948,7 +1004,7 @@ def _views(
     if render_envs is None:
         chosen = list(range(min(num_envs, _MOST_RENDERED if render_mode == "rgb_array" else 1)))
     else:
-        chosen = [_whole("render_envs", i, 0, num_envs - 1) for i in render_envs]
+        chosen = [checked_count("render_envs", i, 0, num_envs - 1) for i in render_envs]
         if len(set(chosen)) < len(chosen) or (render_mode == "human" and len(chosen) != 1):
             raise ValueError(f"render_envs must name each environment once, and one for 'human', got {chosen!r}")
     if render_mode is None:
@@ -976,13 +1032,6 @@ def checked_info_keys(info_keys: Any) -> frozenset[str]:
     return frozenset(map(str, info_keys))
 
 
-def _whole(name: str, value: Any, low: int, high: int) -> int:
-    number = checked_number(name, value, low, high)
-    if number != int(number):
-        raise ValueError(f"{name} must be a whole number in [{low}, {high}], got {value!r}")
-    return int(number)
-
-
 def _listed(places: IntegerArray) -> str:
     return ", ".join(map(str, places[:5].tolist())) + (", ..." if len(places) > 5 else "")
 
@@ -1006,18 +1055,17 @@ def _checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
 
 def _checked_seed(seed: Any) -> int:
     if isinstance(seed, bool | np.bool_) or not isinstance(seed, int | np.integer):
-        raise TypeError(f"seed must be None, a whole number or a sequence of these, got {seed!r}")
+        raise TypeError(f"seed must be None, a whole number or a sequence of these, got {brief_repr(seed)}")
     if seed < 0:
-        raise ValueError(f"seed must be at least 0, got {seed!r}")
+        raise ValueError(f"seed must be at least 0, got {brief_repr(seed)}")
     return int(seed)
 
 
 def _entries(name: str, value: Any, num_envs: int) -> list[Any]:
     """Return what a value says of every environment: the entries of an array, or else the value for all."""
-    if isinstance(value, np.ndarray) and value.ndim == 0:
-        value = value.item()
+    value = without_axes(value)
     if not isinstance(value, np.ndarray | list | tuple):
-        return [value.item() if isinstance(value, np.generic) else value] * num_envs
+        return [value] * num_envs
     if isinstance(value, np.ndarray) and value.ndim > 1:
         raise ValueError(f"{name} must be one value or {num_envs}, got shape {value.shape}")
     if len(value) != num_envs:
@@ -1025,7 +1073,7 @@ def _entries(name: str, value: Any, num_envs: int) -> list[Any]:
     for entry in value:
         if isinstance(entry, list | tuple) or (isinstance(entry, np.ndarray) and entry.ndim > 0):
             raise ValueError(f"{name} must be one value or {num_envs}, got {entry!r} among them")
-    return [entry.item() if isinstance(entry, np.generic | np.ndarray) else entry for entry in value]
+    return [without_axes(entry) for entry in value]
 
 
 def _checked_batch_options(options: Any, num_envs: int) -> tuple[NDArray[np.bool_] | None, list[dict[str, Any]] | None]:

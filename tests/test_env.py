@@ -1,6 +1,7 @@
 """The Gymnasium contract, the reward, the tiers, and the refusals."""
 
 import copy
+import dataclasses
 import math
 import os
 import pickle
@@ -8,6 +9,8 @@ import random
 import subprocess
 import sys
 import warnings
+from decimal import Decimal
+from fractions import Fraction
 
 import gymnasium as gym
 import numpy as np
@@ -15,8 +18,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.env_checker import data_equivalence as same
 
-from sd_friction_env import ENVIRONMENT_IDS, OscillatorParameters, SDFrictionEnv, equilibria, limit_cycle
+from sd_friction_env import ENVIRONMENT_IDS, OscillatorParameters, SDFrictionEnv, equilibria, kernel, limit_cycle
 from sd_friction_env.env import EnvState
+from sd_friction_env.parameters import FRICTIONS, GEOMETRIES
 
 NOMINAL = OscillatorParameters()
 
@@ -189,7 +193,7 @@ def test_losing_contact_terminates_and_costs_more_than_any_way_to_go_on():
         total, steps = total + reward, steps + 1
         if terminated or truncated:
             break
-    assert (terminated, truncated, info["status"]) == (True, False, "contact lost")
+    assert (terminated, truncated, info["status"]) == (True, False, kernel.CONTACT_LOST)
     worst = -info["reward_vibration"]
     assert info["reward_contact_loss"] <= -(100 - steps) * worst
     with pytest.raises(gym.error.ResetNeeded):
@@ -451,7 +455,7 @@ def test_an_action_outside_the_box_is_clipped_and_no_number_is_refused():
         ({"start": "nowhere"}, "start must be one of"),
         ({"parameters": {"alfa": 1}}, "unknown parameter 'alfa'"),
         ({"parameters": {"alpha": -1}}, "alpha must be"),
-        ({"parameters": {"belt_speed": 0.0}}, "belt_speed must be positive"),
+        ({"parameters": {"belt_speed": 0.0}}, "belt_speed must be at least 1e-06"),
     ],
 )
 def test_a_bad_option_is_refused_and_the_episode_goes_on(options, message):
@@ -466,7 +470,7 @@ def test_a_bad_option_is_refused_and_the_episode_goes_on(options, message):
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"gain": 1}, TypeError, "unknown argument 'gain'"),
+        ({"gain": 1}, TypeError, r"__init__\(\) got an unexpected keyword argument 'gain'; allowed: actuator"),
         ({"actuator": "magnet"}, ValueError, "actuator must be one of"),
         ({"control_interval": 0.0}, ValueError, "control_interval must be"),
         ({"control_interval": math.nan}, ValueError, "control_interval must be"),
@@ -476,9 +480,9 @@ def test_a_bad_option_is_refused_and_the_episode_goes_on(options, message):
         ({"randomise": {"alfa": (0, 1)}}, ValueError, "randomise has no parameter 'alfa'"),
         ({"randomise": {"alpha": (0.9, 0.8)}}, ValueError, "low <= high"),
         ({"randomise": {"alpha": 0.9}}, ValueError, "must be a pair"),
-        ({"randomise": {"belt_speed": (0.0, 0.1)}}, ValueError, "belt_speed must be positive"),
+        ({"randomise": {"belt_speed": (0.0, 0.1)}}, ValueError, "belt_speed must be at least 1e-06"),
         ({"randomise": {"mu_m": (0.1, 0.3)}}, ValueError, "mu_m must not exceed"),
-        ({"parameters": {"belt_speed": 0}}, ValueError, "belt_speed must be positive"),
+        ({"parameters": {"belt_speed": 0}}, ValueError, "belt_speed must be at least 1e-06"),
         ({"parameters": 3}, TypeError, "parameters must be"),
         ({"parameters": {3: 1}}, TypeError, "parameters must map parameter names to values, got the name 3"),
         ({"reward": 3}, TypeError, "reward must be a function"),
@@ -488,6 +492,89 @@ def test_a_bad_option_is_refused_and_the_episode_goes_on(options, message):
 def test_a_bad_argument_is_refused_by_name(arguments, error, message):
     with pytest.raises(error, match=message):
         SDFrictionEnv(**arguments)
+
+
+# Whole numbers and fractions beyond the greatest float; the last but one is too long for Python to write.
+BEYOND = (10**400, -(10**400), Fraction(10**400, 3), 10**5000, np.longdouble("1e4000"))
+
+
+@pytest.mark.parametrize("value", BEYOND, ids=["whole", "negative", "fraction", "unwritable", "long double"])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        lambda value: {"parameters": {"alpha": value}},
+        lambda value: {"w_effort": value},
+        lambda value: {"episode_steps": value},
+        lambda value: {"randomise": {"alpha": (0.1, value)}},
+        lambda value: {"x_scale": value},
+    ],
+)
+def test_an_argument_beyond_the_greatest_float_is_refused_by_name(arguments, value):
+    name = next(iter(arguments(value)))
+    name = {"parameters": "alpha", "randomise": r"randomise\['alpha'\] high"}.get(name, name)
+    with pytest.raises(ValueError, match=rf"{name} must be a finite number in \[.*\], got "):
+        SDFrictionEnv(**arguments(value))
+
+
+@pytest.mark.parametrize("value", BEYOND, ids=["whole", "negative", "fraction", "unwritable", "long double"])
+def test_actions_options_and_states_beyond_the_greatest_float_are_refused_and_change_nothing(value):
+    env = make(sensor_delay=1)
+    env.reset(seed=0)
+    before = env.get_state()
+    for action in ([value], np.array([value], object), (value,)):
+        with pytest.raises(ValueError, match="action must be one finite number"):
+            env.step(action)
+    for options in ({"x": value}, {"x": 0.1, "v": value}, {"phase": value}, {"parameters": {"g1": value}}):
+        with pytest.raises(ValueError, match="must be a finite number in"):
+            env.reset(options=options)
+    with pytest.raises(ValueError, match="render_size width must be a whole number"):
+        SDFrictionEnv(render_mode="rgb_array", render_size=(value, 200))
+    if isinstance(value, int):
+        for field in ("steps", "key", "episode"):
+            with pytest.raises(ValueError, match=rf"state\.{field} must be in \[0, 2\*\*63\)"):
+                env.set_state(dataclasses.replace(before, **{field: value}))
+    for ended in (False, True):
+        if not isinstance(value, np.longdouble):  # infinite as a float, which a state that has ended may be
+            with pytest.raises(ValueError, match=r"state\.x must be finite"):
+                env.set_state(dataclasses.replace(before, x=value, ended=ended))
+    if not isinstance(value, np.longdouble):
+        with pytest.raises(TypeError, match=r"state\.past must be a tuple of pairs"):
+            env.set_state(dataclasses.replace(before, past=((0.0, value),)))
+    assert env.get_state() == before
+
+
+def test_fractions_and_numpys_numbers_are_numbers_and_decimals_are_not():
+    env = make(w_effort=Fraction(1, 4), episode_steps=np.int64(7), force_limit=np.float32(0.5))
+    assert (env.task.w_effort, env.task.episode_steps, env.task.force_limit) == (0.25, 7, 0.5)
+    env.reset(seed=2, options={"x": Fraction(1, 2), "v": np.int8(0)})
+    assert env.get_state().x == 0.5
+    first = env.step([Fraction(1, 2)])[0]
+    env.reset(seed=2, options={"x": 0.5, "v": 0.0})
+    assert np.array_equal(first, env.step(np.array([0.5]))[0])
+    with pytest.raises(TypeError, match=r"w_effort must be a real number in .*, got Decimal\('1'\)"):
+        SDFrictionEnv(w_effort=Decimal(1))
+    with pytest.raises(TypeError, match=r"action must be one finite number .* got \[Decimal\('1'\)\] of type object"):
+        env.step([Decimal(1)])
+
+
+def test_arrays_without_axes_are_numbers_in_options():
+    env = make()
+    options = {"x": np.array(0.25), "v": np.float32(0.5), "parameters": {"alpha": np.array(0.7)}}
+    info = env.reset(seed=0, options=options)[1]
+    assert (info["x"], info["v"], info["parameters"]["alpha"]) == (0.25, 0.5, 0.7)
+
+
+def test_info_holds_numbers_and_where_they_stand_for_names_the_tables_say_which():
+    own = {"geometry": "linear", "friction": "hyperbolic"}
+    env = make(episode_steps=1, parameters=own)
+    info = env.reset(seed=0)[1]
+    found = info["parameters"]
+    assert (GEOMETRIES[found["geometry"]], FRICTIONS[found["friction"]]) == ("linear", "hyperbolic")
+    assert {**found, **own} == dataclasses.asdict(env.parameters)
+    last = env.step(np.zeros(1))[4]
+    assert kernel.STATUS_NAMES[last["status"]] == "ok"
+    for holder in (info, found, last, last["statistics"]):
+        assert {type(value) for value in holder.values()} <= {int, float, dict}
 
 
 def test_stepping_before_reset_is_an_error_that_says_so():
@@ -552,6 +639,6 @@ def test_a_legal_plant_whose_equilibrium_is_far_away_makes_an_environment(plant)
     observation, _ = env.reset(seed=0)
     assert abs(observation[0]) < 1.0
     _, reward, _, _, info = env.step(np.zeros(1, np.float32))
-    assert info["status"] == "ok"
+    assert info["status"] == kernel.OK
     assert math.isfinite(reward)
     assert info["x"] == pytest.approx(place, rel=1e-3)

@@ -11,7 +11,7 @@ from sd_friction_env import ENVIRONMENT_IDS
 sb3 = pytest.importorskip("stable_baselines3")
 
 from stable_baselines3.common.monitor import Monitor  # noqa: E402
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize  # noqa: E402
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize  # noqa: E402
 
 from sd_friction_env.sb3 import SDFrictionVecEnv  # noqa: E402
 
@@ -111,6 +111,90 @@ def test_wrappers_attributes_and_methods_reach_the_environments():
     stacked = VecNormalize(VecFrameStack(SDFrictionVecEnv(FORCE, 3), 4))
     assert stacked.reset().shape == (3, 8)
     assert stacked.step(np.zeros((3, 1), np.float32))[0].shape == (3, 8)
+
+
+class Nothing(gym.Env):
+    observation_space = action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+
+def labels(envs, indices):
+    """Return which environments a DummyVecEnv or a batch takes indices for, or the error that it raises."""
+    envs.set_attr("label", None)
+    try:
+        envs.set_attr("label", "here", indices)
+    except (IndexError, TypeError) as error:
+        return type(error), envs.get_attr("label")
+    return len(envs.get_attr("label", indices)), len(envs.env_is_wrapped(Monitor, indices)), envs.get_attr("label")
+
+
+@pytest.mark.parametrize("num_envs", [3, 300])  # from 256 on there is padding behind the last
+def test_indices_are_those_of_a_dummy_vec_env(num_envs):
+    n = num_envs
+    ours, theirs = SDFrictionVecEnv(FORCE, n), DummyVecEnv([Nothing] * n)
+    lists = [[0, -1], (2, 2), [-n, 1], np.array([-2, 1]), np.array([2, 0], np.uint8), range(1, 3), [], {0, 2}]
+    for indices in (None, 0, 1, n - 1, -1, -n, True, *lists, n, -n - 1, 10**30, [0, n], [-n - 1], 1.0, [1.0], ["a"]):
+        assert labels(ours, indices) == labels(theirs, indices), indices
+
+
+def test_the_last_environment_has_the_number_minus_one():
+    envs = SDFrictionVecEnv(FORCE, 300)
+    envs.seed(1)
+    envs.reset()
+    states = envs.env_method("get_state")
+    assert envs.env_method("get_state", indices=-1) == envs.env_method("get_state", indices=299) == states[-1:]
+    envs.env_method("set_state", states[5], indices=-300)
+    envs.env_method("set_state", states[6], indices=[-1])
+    assert envs.env_method("get_state") == [states[5], *states[1:-1], states[6]]
+    first = envs.step(np.ones((300, 1), np.float32))[0]
+    assert np.array_equal(first[[0, 299]], first[[5, 6]])
+    for indices in (300, -301, [0, 300]):
+        for call in (
+            lambda indices: envs.env_method("reset", indices=indices),
+            lambda indices: envs.get_attr("task", indices),
+            lambda indices: envs.set_attr("mark", 1, indices),
+            lambda indices: envs.env_is_wrapped(Monitor, indices),
+        ):
+            with pytest.raises(IndexError, match=r"indices must be in \[-300, 299\], got"):
+                call(indices)
+    assert not envs.has_attr("mark")
+    assert [state.steps for state in envs.env_method("get_state")] == [1] * 300  # none was reset
+
+
+PLAIN = ("late_amplitude", "late_stick_fraction", "length", "return")
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **limit: VecMonitor(SDFrictionVecEnv(FORCE, 2, **limit), info_keywords=PLAIN),
+        lambda **limit: VecMonitor(dummy(FORCE, 2, **limit), info_keywords=PLAIN),
+        lambda **limit: DummyVecEnv([lambda: Monitor(gym.make(FORCE, **limit), info_keywords=PLAIN)] * 2),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:The environment is already wrapped with a `Monitor`:UserWarning")
+def test_a_monitor_finds_the_statistics_that_it_is_asked_for(make):
+    envs = make(max_episode_steps=8)
+    envs.seed(3)
+    envs.reset()
+    for _ in range(8):
+        infos = envs.step(np.zeros((2, 1), np.float32))[3]
+    for info in infos:
+        told = {name: info["episode"][name] for name in PLAIN}
+        assert told == {name: info["statistics"][name] for name in PLAIN}
+        assert told["length"] == info["episode"]["l"] == 8
+        assert told["late_amplitude"] >= 0.0
+
+
+def test_a_reset_within_a_step_leaves_the_infos_that_a_dummy_vec_env_leaves():
+    ours, theirs = SDFrictionVecEnv(FORCE, 2, episode_steps=3), dummy(FORCE, 2, episode_steps=3)
+    for envs in (ours, theirs):
+        envs.seed(5)
+        envs.reset()
+    for _ in range(7):
+        for envs in (ours, theirs):
+            envs.step(np.zeros((2, 1), np.float32))
+        assert all(map(same, ours.reset_infos, theirs.reset_infos))
+    assert ours.reset_infos[0]["parameters"]["alpha"] == 0.8
 
 
 def test_states_are_taken_and_given_back():

@@ -349,7 +349,7 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
         (["--set", "policy_kwargs=dict(net_arch=[0])"], "a width in net_arch must be"),
         (["--set", "policy_kwargs=dict(activation_fn=nn.Module)"], "activation_fn must be one of Tanh, ReLU"),
         (["--env-arg", "w_effort=-1"], "w_effort must be a finite number in [0, 1e+06], got -1"),
-        (["--env-arg", "colour=red"], "unknown argument 'colour'"),
+        (["--env-arg", "colour=red"], "unexpected keyword argument 'colour'"),
         (["--hyperparameters", "gone.yml"], "cannot be read from 'gone.yml'"),
     ],
 )

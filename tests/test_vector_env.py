@@ -2,17 +2,24 @@
 
 import copy
 import dataclasses
+import os
 import pickle
+import subprocess
+import sys
 import tracemalloc
+from fractions import Fraction
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList
 
 from sd_friction_env import ENVIRONMENT_IDS, OscillatorParameters, SDFrictionVectorEnv, kernel, limit_cycle
+from sd_friction_env.env import PLAIN_STATISTICS
 from sd_friction_env.orbits import OrbitError
 from sd_friction_env.task import Task
+from sd_friction_env.vector_env import REWARD_TERMS
 
 MODES = [mode.value for mode in AutoresetMode]
 
@@ -545,8 +552,14 @@ def test_an_environment_of_the_batch_takes_less_than_a_kibibyte():
         ({"render_mode": "ascii"}, "render_mode must be one of"),
         ({"render_mode": "rgb_array", "render_envs": [9]}, "render_envs must be"),
         ({"render_mode": "rgb_array", "render_envs": [1, 1]}, "render_envs must name each environment once"),
-        ({"max_episode_steps": 10}, "use episode_steps"),
-        ({"alpha": 0.2}, "unknown argument 'alpha'"),
+        ({"max_episode_steps": 0}, r"max_episode_steps must be a finite number in \[1, 1e\+09\], got 0"),
+        ({"max_episode_steps": 1.5}, "max_episode_steps must be a whole number"),
+        ({"max_episode_steps": 10**400}, "max_episode_steps must be a finite number"),
+        ({"max_episode_steps": 5, "episode_steps": "few"}, "episode_steps must be a real number"),
+        ({"num_envs": 10**400}, "num_envs must be a finite number"),
+        ({"threads": 10**5000}, "threads must be a finite number"),
+        ({"render_mode": "rgb_array", "render_envs": [10**400]}, "render_envs must be a finite number"),
+        ({"alpha": 0.2}, r"__init__\(\) got an unexpected keyword argument 'alpha'"),
         ({"parameters": {"alpha": -1}}, "alpha must be"),
         ({"parameters": {3: 1}}, "parameters must map parameter names to values, got the name 3"),
     ],
@@ -579,6 +592,14 @@ def test_bad_arguments_are_named(arguments, message):
         ({"options": {"parameters": {"alpha": [1.0]}}}, r"options\['parameters'\]\['alpha'\] must be one value or 3"),
         ({"options": {"parameters": {"alpha": [0.5, 0.5, -1.0]}}}, "alpha must be"),
         ({"options": {"parameters": [{}]}}, r"options\['parameters'\] must be a mapping or 3"),
+        ({"options": {"x": 10**400}}, r"options\['x'\] must be a finite number in \[-10, 10\], got 1000"),
+        (
+            {"options": {"x": [0.1, 0.2, 10**5000]}},
+            r"options\['x'\] must be a finite number in \[-10, 10\], got a value",
+        ),
+        ({"options": {"parameters": {"alpha": [0.5, 10**400, 0.5]}}}, "alpha must be a finite number in"),
+        ({"seed": -(10**5000)}, "seed must be at least 0, got a value"),
+        ({"seed": [1, 2, Fraction(10**400, 3)]}, "seed must be None, a whole number"),
         ({"options": {"reset_mask": [True, False, False]}}, "reset_mask"),
         ({"options": {"reset_mask": np.zeros(3, bool)}}, "with a True in it"),
         ({"options": {"reset_mask": np.ones(2, bool)}}, "reset_mask"),
@@ -602,6 +623,9 @@ def test_a_reset_that_is_refused_changes_nothing(arguments, message):
         (np.zeros((2, 1)), r"shape \(3, 1\), got shape \(2, 1\)"),
         ([[0.0], [np.nan], [0.0]], "environment 1 got"),
         ([[0.0], [0.0], [-np.inf]], "environment 2 got"),
+        ([[0.0], [10**400], [0.0]], "actions must be finite numbers"),
+        (np.array([[0.0], [-(10**5000)], [0.0]], object), "actions must be finite numbers"),
+        ([[0.0], [Fraction(10**400, 3)], [0.0]], "actions must be finite numbers"),
         ("left", "actions must be"),
         (None, "actions must be"),
         ([[0.0], [0.0, 1.0], 0.0], "actions must be finite numbers"),
@@ -698,6 +722,13 @@ def states_with(envs, **changes):
         ({"x": "a"}, r"states\[1\]\.x must be a real number, got 'a'"),
         ({"x": np.zeros(2)}, r"states\[1\]\.x must be a real number, got array"),
         ({"v": np.nan}, r"states\[1\]\.v must be finite, got nan"),
+        ({"x": 10**400}, r"states\[1\]\.x must be finite, got 1000"),
+        (
+            {"worst_cost": -(10**5000), "ended": True},
+            r"states\[1\]\.worst_cost must be finite, got a value",
+        ),
+        ({"episode": 10**400}, r"states\[1\]\.episode must be in \[0, 2\*\*63\), got 1000"),
+        ({"past": ((1.0, 10**400),)}, r"states\[1\]\.past must be a tuple of pairs"),
         ({"steps": 1.5}, r"states\[1\]\.steps must be a whole number, got 1\.5"),
         ({"key": -1}, r"states\[1\]\.key must be in \[0, 2\*\*63\), got -1"),
         ({"ended": 3}, r"states\[1\]\.ended must be True or False, got 3"),
@@ -716,6 +747,151 @@ def test_a_state_made_by_hand_is_refused_before_any_is_taken(changed, message):
     with pytest.raises((TypeError, ValueError), match=message):
         envs.set_states(bad)
     assert envs.get_states() == before
+
+
+def test_of_environments_that_are_reset_within_a_step_info_tells_what_reset_tells():
+    for mode in ("NextStep", "SameStep"):
+        kwargs = {"num_envs": 4, "episode_steps": 6, "autoreset_mode": mode}
+        ours = DictInfoToList(batch("SDFriction/ForceRandomised-v0", **kwargs))
+        theirs = DictInfoToList(one_by_one("SDFriction/ForceRandomised-v0", **kwargs))
+        names = [set(info) for info in ours.reset(seed=3)[1]]
+        theirs.reset(seed=3)
+        states = [dataclasses.replace(state, steps=i) for i, state in enumerate(ours.unwrapped.get_states())]
+        ours.unwrapped.set_states(states)  # so that they end one after another
+        for env, state in zip(theirs.unwrapped.envs, states, strict=True):
+            env.unwrapped.set_state(state)
+        resets, over = 0, np.zeros(4, bool)
+        for _ in range(20):
+            *_, terminated, truncated, mine = ours.step(np.zeros((4, 1), np.float32))
+            reference = theirs.step(np.zeros((4, 1), np.float32))[4]
+            is_reset = over if mode == "NextStep" else terminated | truncated
+            over = terminated | truncated
+            for i in np.flatnonzero(is_reset):
+                final = {name: mine[i].pop(name) for name in ("final_obs", "final_info") if name in mine[i]}
+                assert set(final) == ({"final_obs", "final_info"} if mode == "SameStep" else set())
+                assert set(mine[i]) == names[i]
+                assert {name: reference[i][name] for name in mine[i]} == mine[i]
+                resets += 1
+            for i in np.flatnonzero(~is_reset):
+                assert set(mine[i]) - {"statistics", *PLAIN_STATISTICS} == set(REWARD_TERMS)
+        assert resets >= 8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "length"),
+    [
+        ({"max_episode_steps": 5}, 5),
+        ({"max_episode_steps": 5, "episode_steps": 9}, 5),
+        ({"max_episode_steps": 9, "episode_steps": 5}, 5),
+        ({"max_episode_steps": 510}, 510),
+        ({"max_episode_steps": -1, "episode_steps": 6}, 6),
+        ({}, 500),
+    ],
+)
+def test_a_time_limit_is_known_to_the_batch_and_to_its_spec(arguments, length):
+    envs = batch(num_envs=2, **arguments)
+    assert envs.spec.max_episode_steps == envs.unwrapped.task.episode_steps == length
+    twin = batch(num_envs=2, episode_steps=length)
+    assert differences(envs.reset(seed=0), twin.reset(seed=0)) == []
+    for _ in range(length):
+        step = envs.step(np.ones((2, 1), np.float32))
+        assert differences(step, twin.step(np.ones((2, 1), np.float32))) == []
+    assert step[3].all()
+    assert step[4]["statistics"]["length"].tolist() == step[4]["length"].tolist() == [length] * 2
+    again = gym.make_vec(envs.spec)
+    assert (again.num_envs, again.unwrapped.task) == (2, envs.unwrapped.task)
+
+
+def test_places_are_those_of_a_list():
+    envs = batch(num_envs=300).unwrapped
+    for indices, places in (
+        (None, list(range(300))),
+        (-1, [299]),
+        (np.int64(-300), [0]),
+        (np.array(7), [7]),
+        ((2, -2), [2, 298]),
+        (np.array([5, -5], np.int8), [5, 295]),
+        ((i for i in (1, 1)), [1, 1]),
+        (range(3), [0, 1, 2]),
+        ([], []),
+        (True, [1]),
+    ):
+        assert envs.places(indices) == places
+    for indices in (300, -301, [0, 300], np.array([-301]), 10**400):
+        with pytest.raises(IndexError, match=r"indices must be in \[-300, 299\], got "):
+            envs.places(indices)
+    for indices in (1.0, "ab", [None], np.array([True, False]), [[1]]):
+        with pytest.raises(TypeError, match="indices must be None, a whole number or several of them, got "):
+            envs.places(indices)
+
+
+# What the cases below run in a process of their own: threads, once started, stay in a process.
+FORKING = """
+import hashlib, multiprocessing, os, sys, threading
+import gymnasium as gym, numba, numpy as np, sd_friction_env
+
+def steps(envs, count=5):
+    digest = hashlib.sha256()
+    for k in range(count):
+        for part in envs.step(np.full((envs.num_envs, 1), 0.1 * k))[:4]:
+            digest.update(part.tobytes())
+    return digest.hexdigest()
+
+def made(threads, **law):
+    envs = gym.make_vec("SDFriction/Force-v0", num_envs=2048, threads=threads, parameters=law)
+    envs.reset(seed=0)
+    return envs
+
+@numba.njit(parallel=True)
+def total(values):
+    result = 0.0
+    for i in numba.prange(len(values)):
+        result += values[i]
+    return result
+
+def in_fork(function):
+    reading, writing = os.pipe()
+    if (child := os.fork()) == 0:
+        os.write(writing, function().encode())
+        os._exit(0)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert status == 0, f"the child ended with {status}"
+    return os.read(reading, 100).decode()
+
+def in_process(function):
+    context = multiprocessing.get_context("fork")
+    queue = context.SimpleQueue()
+    child = context.Process(target=lambda: queue.put(function()))
+    child.start()
+    child.join()
+    assert child.exitcode == 0, f"the child ended with {child.exitcode}"
+    return queue.get()
+
+def twice(function):
+    return lambda: in_fork(function)
+
+def stepped_on(envs):
+    steps(envs)
+    return envs
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+@pytest.mark.parametrize(
+    "case",
+    [
+        "envs, twin = stepped_on(made(2)), stepped_on(made(1)); run = lambda: steps(envs)",
+        "stepped_on(made(2)); twin = made(1); run = lambda: steps(made(2))",
+        "total(np.ones(9)); envs, twin = made(2), made(1); run = lambda: steps(envs)",
+        "envs, twin = made(2), made(1); run = lambda: steps(envs)",
+        # a child of the child, and another law
+        "envs, twin = (stepped_on(made(k, friction='coulomb')) for k in (2, 1)); run = twice(lambda: steps(envs))",
+    ],
+)
+@pytest.mark.parametrize("way", ["in_fork", "in_process"])
+def test_a_forked_process_steps_the_same_bits_whoever_has_started_threads(case, way):
+    code = f"{FORKING}\n{case}\nassert {way}(run) == steps(twin)\n"
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=300)
 
 
 def test_states_are_as_many_as_environments_and_in_order():
@@ -764,7 +940,7 @@ def test_a_thousand_million_steps_leave_nothing_broken():
             assert np.isfinite(observations).all()
             assert (rewards <= 0.0).all()
             assert not terminated.any()
-            assert (info["status"][info["_status"]] == "ok").all()
+            assert (info["status"] == kernel.OK).all()
             assert (info["normal_force"] > 0.0).all()
             v_rel = info["v"] - info["v_belt"]
             assert (np.sign(v_rel) == info["mode"]).all() or (v_rel[np.sign(v_rel) != info["mode"]] == 0.0).all()

@@ -41,7 +41,6 @@ from sd_friction_env.parameters import (
     checked_number,
     law_numbers,
 )
-from sd_friction_env.startup import announced
 from sd_friction_env.task import PHASE_SLOT, FloatArray, IntegerArray, passive_motion
 from sd_friction_env.theory import stribeck_coefficients
 
@@ -452,12 +451,11 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             return
         own = starts.own[columns]
         left = columns[own]
-        with announced("starts in a batch"):
-            beyond = kernel.NO_LAWS if starts.beyond else None
-            kernel.place_on_cycle(state, integers, columns[~own], *self._nominal_start, beyond)
-            if task.start == "cycle":
-                phases = task.phases(keys, episodes)[own]
-                left = left[kernel.own_cycle_starts(state, integers, left, phases, beyond) == 1]
+        beyond = kernel.NO_LAWS if starts.beyond else None
+        kernel.place_on_cycle(state, integers, columns[~own], *self._nominal_start, beyond)
+        if task.start == "cycle":
+            phases = task.phases(keys, episodes)[own]
+            left = left[kernel.own_cycle_starts(state, integers, left, phases, beyond) == 1]
         for j in left.tolist():
             single = self._as_parameters(starts.numbers[:, j], _kinds(state, integers, j))
             key, episode = integers[[kernel.I_KEY, kernel.I_EPISODE], j].tolist()
@@ -650,9 +648,8 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             *out,
         )
         if not self._is_warm:
-            with announced("step of a batch"):
-                self._is_warm = True
-                return self._advance(actions, out)
+            self._is_warm = True
+            return self._advance(actions, out)
         if len(self._works) == 1:
             ended: int = self._stepper(self._works[0], 0, self.num_envs, *arguments)
             return ended

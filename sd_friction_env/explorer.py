@@ -657,6 +657,8 @@ class Page:
     def tick(self) -> None:
         """Do what the user asks for; let a little time pass, and show it."""
         if self.ended:
+            if self.idle_ticks > _IDLE_TICKS:  # a tick later, so that the browser has got the message
+                self.on_idle()
             return
         self._follow()
         for work in (self.plant_work, self.basin_work):
@@ -666,7 +668,6 @@ class Page:
         if self.idle_ticks > _IDLE_TICKS:
             self.message.text = "Ended, for nobody has touched this page for half an hour: reload it to go on."
             self.end()
-            self.on_idle()
             return
         if self.pause.active:
             return

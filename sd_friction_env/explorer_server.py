@@ -20,7 +20,6 @@ from bokeh.server.tornado import BokehTornado
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPServerRequest
 from tornado.ioloop import IOLoop
-from tornado.netutil import bind_sockets
 from tornado.web import HTTPError, RequestHandler
 
 from sd_friction_env.explorer import SESSIONS, Page
@@ -152,10 +151,11 @@ def make_server(host: str, port: int, allowed: Iterable[str] = (), sessions: int
     """
     allowed = list(allowed)
     served_hosts(host, port, allowed)
-    sockets = bind_sockets(port, host)
-    port = sockets[0].getsockname()[1]
+    listening = socket.create_server((host, port))
+    listening.setblocking(False)
+    port = listening.getsockname()[1]
     application = ExplorerApplication(served_hosts(host, port, allowed), sessions)
     http = HTTPServer(application)
-    http.add_sockets(sockets)
+    http.add_sockets([listening])
     server = BaseServer(IOLoop.current(), application, http)
     return server, f"http://{'localhost' if host == EVERYWHERE else host}:{port}/"

@@ -283,10 +283,9 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         else:
             steppers = kernel.STEPPERS if alone else kernel.STEPPERS_IN_THREADS
             self._stepper = steppers[self.nominal.geometry_code]
-        self._is_warm = False
 
     def __getstate__(self) -> dict[str, Any]:
-        anew = ("_stepper", "_is_warm", "_kept", "_all", "_all_ok", "_masks")
+        anew = ("_stepper", "_kept", "_all", "_all_ok", "_masks")
         return {name: value for name, value in vars(self).items() if name not in anew}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -647,9 +646,6 @@ class SDFrictionVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             self._observations,
             *out,
         )
-        if not self._is_warm:
-            self._is_warm = True
-            return self._advance(actions, out)
         if len(self._works) == 1:
             ended: int = self._stepper(self._works[0], 0, self.num_envs, *arguments)
             return ended

@@ -121,11 +121,12 @@ def write_video(
     target = check_video_path(path, fps)
     import imageio.v2 as imageio
 
-    unfinished = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+    ending = target.suffix.lower()  # as imageio knows it
+    unfinished = target.with_name(f".{target.stem}.{os.getpid()}{ending}")
     # A GIF keeps its frames small by few colours; the pictures have few.
     options: dict[str, Any] = (
         {"duration": 1000.0 / fps, "loop": 0, "subrectangles": True, "palettesize": 32}
-        if target.suffix.lower() == ".gif"
+        if ending == ".gif"
         else {"fps": fps, "macro_block_size": 2, "codec": "libx264", "quality": 7, "ffmpeg_log_level": "error"}
     )
     try:

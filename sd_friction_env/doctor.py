@@ -104,12 +104,14 @@ def _agent_fault(env_id: str) -> str:
 
 
 def _cache() -> dict[str, Any]:
-    """Return where numba keeps what it compiled of ours: the folder it uses, None if it can write to none."""
-    is_compiled = isinstance(kernel.settle, Dispatcher)  # not with NUMBA_DISABLE_JIT
+    """Return where numba keeps what it compiled of ours: the folder it uses, or None and the reason."""
+    is_compiled = isinstance(kernel.settle, Dispatcher)
     folder = kernel.settle.stats.cache_path if is_compiled else None
+    reason = NO_FOLDER if is_compiled else "nothing is compiled: NUMBA_DISABLE_JIT is set"
     files = list(Path(folder).glob("kernel.*.nb[ic]")) if folder is not None else []
     return {
         "folder": folder,
+        "reason": "" if folder is not None else reason,
         "files": len(files),
         "megabytes": round(sum(file.stat().st_size for file in files) / 1e6, 1),
     }
@@ -151,7 +153,7 @@ def as_text(findings: dict[str, Any], *, colour: bool = False) -> str:
         took = f"{1e3 * found['seconds']:.2f} ms (first call {found['first_call_seconds']:.2f} s)"
         lines = [f"{'kernel':16} limit cycle of amplitude {found['amplitude']:.10f} in {took}"]
     if cache["folder"] is None:
-        lines.append(mark(False, f"{'compiled code':16} {NO_FOLDER}"))
+        lines.append(mark(False, f"{'compiled code':16} {cache['reason']}"))
     else:
         lines.append(f"{'compiled code':16} {cache['files']} files, {cache['megabytes']} MB, in {cache['folder']}")
     lines += [

@@ -406,6 +406,7 @@ def training_times(agents: Sequence[Agent], passive: float, optimum: float) -> l
 # Pictures -------------------------------------------------------------------------------------------------------------
 
 
+@plotting.house_style()
 def draw_scores(rows: Sequence[Row]) -> "Figure":
     """Draw scores and suppressed fractions of one task and tier with their intervals."""
     figure, axes = plotting.new_figure(9.0, 1.4 + 0.32 * len(rows), 1, 2, sharey=True)
@@ -430,6 +431,7 @@ def draw_scores(rows: Sequence[Row]) -> "Figure":
     return figure
 
 
+@plotting.house_style()
 def draw_sweeps(rows: Sequence[Row], task: str) -> "Figure":
     """Draw the settled amplitudes of all sweeps of a task."""
     figure, axes = plotting.new_figure(8.0, 3.0 * len(SWEEPS) + 1.2, len(SWEEPS), 1)
@@ -458,6 +460,7 @@ def draw_sweeps(rows: Sequence[Row], task: str) -> "Figure":
 _PASSIVE: dict[str, Any] = {"color": plotting.GREY, "linestyle": "-", "linewidth": 2.5}
 
 
+@plotting.house_style()
 def draw_learning(rows: Sequence[Row], references: Mapping[str, float]) -> "Figure":
     """Draw the learning curves of one task and tier: line the interquartile mean over runs, band least to greatest.
 
@@ -494,6 +497,7 @@ def draw_learning(rows: Sequence[Row], references: Mapping[str, float]) -> "Figu
     return figure
 
 
+@plotting.house_style()
 def draw_histories(histories: Mapping[str, Table]) -> "Figure":
     """Draw displacement, velocity, action and phase portrait of histories from one start, passive first."""
     figure, axes = plotting.new_figure(11.0, 6.2, 2, 2, width_ratios=(1.6, 1.0))

@@ -37,8 +37,8 @@ import gymnasium as gym
 import numpy as np
 
 import sd_friction_env
-from sd_friction_env import OscillatorParameters, kernel, limit_cycle
-from sd_friction_env.tables import atomic_file
+from sd_friction_env import OscillatorParameters, kernel, limit_cycle, plotting
+from sd_friction_env.tables import atomic_file, checked_ending
 
 ROOT = Path(__file__).resolve().parent.parent
 FORCE, BELT = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0"
@@ -1302,9 +1302,9 @@ def as_json(bench: Bench, said: Mapping[str, Any], *, interrupted: bool) -> dict
     }
 
 
+@plotting.house_style()
 def draw(rows: Rows, path: Path) -> None:
     """Draw the rates as bars, one panel for what can be compared, ours in another colour."""
-    import matplotlib
     from matplotlib.figure import Figure
 
     panels: dict[str, list[tuple[str, Row]]] = {}
@@ -1334,9 +1334,7 @@ def draw(rows: Rows, path: Path) -> None:
     low, high = last.get_xlim()
     last.set_xlim(min(3e3, low), 4.0 * high)
     last.set_xlabel("environment steps per second (median; lines: quartiles); ours in red")
-    kind = path.suffix[1:]
-    with matplotlib.rc_context({"svg.hashsalt": ""}), atomic_file(path, "wb") as file:
-        figure.savefig(file, format=kind, dpi=150)
+    plotting.save_figure(figure, path)
 
 
 def _rate(value: float) -> str:
@@ -1375,8 +1373,12 @@ def _parsed(arguments: list[str] | None) -> argparse.Namespace:
             parser.error(f"--{name} {str(path)!r} lies in no existing folder")
         if path is not None and path.is_dir():
             parser.error(f"--{name} {str(path)!r} is a folder; a file is wanted")
-    if options.plot is not None and options.plot.suffix not in (".png", ".pdf", ".svg"):
-        parser.error(f"--plot must end in .png, .pdf or .svg, got {str(options.plot)!r}")
+    try:
+        for name, endings in (("out", (".json",)), ("plot", plotting.FORMATS)):
+            if getattr(options, name) is not None:
+                checked_ending(getattr(options, name), endings, f"--{name}")
+    except ValueError as error:
+        parser.error(str(error))
     if options.peers is None:
         options.peers = _default_peers()
     else:

@@ -80,7 +80,7 @@ def check(parser: Parser, options: argparse.Namespace) -> None:
     if batch < 2 * options.num_minibatches:
         parser.error(f"--num-minibatches must leave 2 of the {batch} steps to each, got {options.num_minibatches}")
     if options.out is not None:
-        if options.out.suffix != ".npz":
+        if options.out.suffix.lower() != ".npz":
             parser.error(f"--out must end in .npz, got {str(options.out)!r}")
         if not os.access(options.out.parent, os.W_OK):
             parser.error(f"--out must lie in a folder that can be written to, got {str(options.out)!r}")

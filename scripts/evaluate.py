@@ -66,7 +66,7 @@ def load_agent(path: Path) -> tuple[Policy, dict[str, Any] | None]:
     Raises:
         ValueError: if it is neither a finished run folder nor a policy file.
     """
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         try:
             return load_policy(path), None
         except FileNotFoundError as error:

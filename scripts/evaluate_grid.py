@@ -19,6 +19,7 @@ from scripts.evaluate import check_fit, load_agent
 from scripts.train import TASKS, TIERS, Parser, environment_id
 from sd_friction_env import cli, load_pretrained
 from sd_friction_env.policies import Policy, ZeroPolicy
+from sd_friction_env.tables import checked_ending
 
 
 def make_parser() -> Parser:
@@ -63,6 +64,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not 1 <= options.episodes <= len(evaluation.EVALUATION_SEEDS):
         parser.error(f"--episodes must be in [1, {len(evaluation.EVALUATION_SEEDS)}], got {options.episodes}")
+    if options.out is not None:
+        try:
+            checked_ending(options.out, (".csv",), "--out")
+        except ValueError as error:
+            parser.error(str(error))
     if options.out is not None and (options.out.is_dir() or not options.out.parent.is_dir()):
         parser.error(f"--out must be a file in a folder that exists, got {str(options.out)!r}")
     try:

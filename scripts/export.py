@@ -53,7 +53,7 @@ def chosen(parser: Parser, options: argparse.Namespace) -> tuple[NetworkPolicy, 
         if env_id is None:
             parser.error("name a run folder or a policy.npz, or --task for the package's own agent")
         return load_pretrained(env_id), env_id
-    if options.agent.suffix == ".npz":
+    if options.agent.suffix.lower() == ".npz":
         if env_id is None:
             parser.error(f"{str(options.agent)!r} needs --task (and --tier): which environment it controls")
         policy = load_policy(options.agent)
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = make_parser()
     options = parser.parse_args(arguments)
     out: Path = options.out
-    if out.suffix != ".onnx" or not out.absolute().parent.is_dir() or out.is_dir():
+    if out.suffix.lower() != ".onnx" or not out.absolute().parent.is_dir() or out.is_dir():
         parser.error(f"--out must be a file FILE.onnx in a folder that exists, got {str(out)!r}")
     if out.exists() and not options.force:
         parser.error(f"--out {str(out)!r} exists: replace it with --force")

@@ -37,6 +37,7 @@ def compute() -> Table:
     return Table(columns, metadata(OscillatorParameters(geometry=geometry) for geometry in PANELS))
 
 
+@plotting.house_style()
 def draw(table: Table, path: Path) -> None:
     """Draw displacement, velocity and phase plane: a column for each belt speed, both geometries in each panel."""
     figure, axes = plotting.new_figure(10.5, 8.0, 3, len(BELT_SPEEDS))

@@ -21,6 +21,7 @@ def compute() -> Table:
     return stack((curve_with_edges(plant, BELT_SPEEDS, geometry=plant.geometry) for plant in plants), metadata(plants))
 
 
+@plotting.house_style()
 def draw(
     table: Table,
     path: Path,

@@ -30,6 +30,7 @@ def compute() -> Table:
     return stack(curves, metadata(plants))
 
 
+@plotting.house_style()
 def draw(table: Table, path: Path) -> None:
     """Draw a row for each quantity and a column for each geometry."""
     figure, axes = plotting.new_figure(10.5, 10.5, len(ROWS), len(PANELS), sharex=True, sharey="row")

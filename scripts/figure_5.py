@@ -30,6 +30,7 @@ def compute() -> Table:
     return stack(curves, metadata(plants.values()))
 
 
+@plotting.house_style()
 def draw(table: Table, path: Path) -> None:
     """Draw a panel for each geometry."""
     figure, axes = plotting.new_figure(10.5, 4.2, 1, len(PANELS), sharey=True)

@@ -27,6 +27,7 @@ def compute() -> Table:
     return Table({name: [row[name] for row in rows] for name in rows[0]}, metadata(PLANTS))
 
 
+@plotting.house_style()
 def draw(table: Table, path: Path) -> None:
     """Draw the basins of both oscillators; the grids are computed again, for they are too large to keep."""
     figure, axes = plotting.new_figure(11.0, 4.2, 1, len(PLANTS))

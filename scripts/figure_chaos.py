@@ -35,6 +35,7 @@ def compute() -> Table:
     return Table({name: [row[name] for row in rows] for name in rows[0]}, metadata([PLANT]) | exponent)
 
 
+@plotting.house_style()
 def draw(table: Table, path: Path) -> None:
     """Draw the sweep, and section, portrait and basins at one value; their points are computed again, for they are too
     many to keep."""

@@ -59,6 +59,7 @@ def on_plane(policy: OptimalPolicy) -> tuple[NDArray[np.float64], NDArray[np.flo
     return x, v, -grid.interpolate(policy.values, states)
 
 
+@plotting.house_style()
 def draw(table: Table, path: Path) -> None:
     """Draw a row for each actuator: the cost still to come on the left, the best action on the right."""
     from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap

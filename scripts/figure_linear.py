@@ -27,6 +27,7 @@ def compute() -> Table:
     return Table(curve | closed | {"closed_pure_slip": first}, metadata([PLANT]))
 
 
+@plotting.house_style()
 def draw(table: Table, path: Path) -> None:
     """Draw the upper half-amplitude of stick-slip and the amplitude of pure slip, each with its closed form."""
     figure, axes = plotting.new_figure(10.5, 4.0, 1, 2)

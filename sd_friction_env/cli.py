@@ -21,7 +21,7 @@ import sd_friction_env
 from sd_friction_env import plotting, sweeps
 from sd_friction_env.basins import LOST_CONTACT, UNDECIDED, basin_grid
 from sd_friction_env.curves import checked_belt_speeds
-from sd_friction_env.doctor import as_text, examine, hyperparameter_folder
+from sd_friction_env.doctor import as_text, examine, hyperparameter_folder, versions_as_text
 from sd_friction_env.forced import lyapunov_exponent, poincare_section
 from sd_friction_env.orbits import OrbitError, critical_belt_speeds, first_lyapunov_coefficient, limit_cycle
 from sd_friction_env.parameters import FRICTIONS, GEOMETRIES, RANGES, OscillatorParameters
@@ -29,8 +29,7 @@ from sd_friction_env.policies import Policy, VelocityFeedback, ZeroPolicy, load_
 from sd_friction_env.pretrained import load_pretrained
 from sd_friction_env.rendering import checked_size
 from sd_friction_env.simulation import simulate
-from sd_friction_env.startup import announced
-from sd_friction_env.tables import Table, atomic_file
+from sd_friction_env.tables import Table, atomic_file, checked_ending
 
 FAILURE, BAD_USAGE, INTERRUPTED = 1, 2, 130
 
@@ -307,10 +306,13 @@ def parser() -> argparse.ArgumentParser:
         "explore",
         _explore,
         "the oscillator live in the browser, with sliders, controllers and your own hand",
-        ["", "--port 8080 --no-browser"],
+        ["", "--port 8080 --no-browser", "--host 0.0.0.0 --allow-host oscillator.example.org --no-browser"],
     )
     command.add_argument("--port", type=int, default=5006, help="0: any that is free (default: 5006)")
     command.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
+    text = "serve it under these names too, of a proxy or a forwarded port (default: its address and localhost alone)"
+    command.add_argument("--allow-host", nargs="+", default=[], metavar="NAME[:PORT]", help=text)
+    command.add_argument("--sessions", type=int, default=8, metavar="N", help="pages at a time (default: 8)")
     command.add_argument("--no-browser", action="store_true", help="open no browser, print the address")
 
     command = _bare_command(
@@ -405,12 +407,11 @@ def _start(options: argparse.Namespace) -> tuple[float, float | None]:
 
 def _check_output(options: argparse.Namespace) -> None:
     """Refuse names that could not be written at the end of a long computation."""
-    for name, endings in (("out", (".csv", ".json")), ("plot", (".png", ".svg", ".pdf"))):
+    for name, endings in (("out", (".csv", ".json")), ("plot", plotting.FORMATS)):
         path = getattr(options, name, None)
         if path is None:
             continue
-        if path.suffix not in endings:
-            raise UsageError(f"--{name} {str(path)!r} must end in {', '.join(endings)}")
+        checked_ending(path, endings, f"--{name}")
         if not path.parent.is_dir():
             raise UsageError(f"--{name} {str(path)!r} lies in no existing folder: make {str(path.parent)!r} first")
         if path.is_dir():
@@ -432,7 +433,7 @@ def _emit(options: argparse.Namespace, table: Table) -> None:
             print(document)
         else:
             table.write(sys.stdout)
-    elif options.out.suffix == ".json":
+    elif options.out.suffix.lower() == ".json":
         with atomic_file(options.out) as file:
             file.write(document + "\n")
     else:
@@ -632,9 +633,17 @@ def _explore(options: argparse.Namespace) -> int:
         raise UsageError(f"--port must be in [0, 65535], got {options.port}")
     if not options.host or ":" in options.host:
         raise UsageError(f"--host must be a name or an IPv4 address, got {options.host!r}")
-    explorer.require_bokeh()
+    if not 1 <= options.sessions <= explorer.MOST_SESSIONS:
+        raise UsageError(f"--sessions must be in [1, {explorer.MOST_SESSIONS}], got {options.sessions}")
     try:
-        explorer.serve(options.host, options.port, browser=not options.no_browser, say=_say)
+        explorer.serve(
+            options.host,
+            options.port,
+            allowed=options.allow_host,
+            sessions=options.sessions,
+            browser=not options.no_browser,
+            say=_say,
+        )
     except OSError as error:
         raise UsageError(f"cannot listen at --host {options.host} --port {options.port}: {error}") from None
     return 0
@@ -686,7 +695,7 @@ def _agent(options: argparse.Namespace, env_id: str) -> tuple[Policy, str]:
     if options.agent == "velocity-feedback":
         gain = _VELOCITY_GAIN if options.gain is None else options.gain
         return VelocityFeedback.from_env(env, gain), "velocity feedback"
-    if not options.agent.endswith(".npz"):
+    if not options.agent.lower().endswith(".npz"):
         known = "pretrained, velocity-feedback, none or a policy.npz"
         raise UsageError(f"--agent must be {known}, got {options.agent!r}")
     try:
@@ -713,6 +722,8 @@ def _hyperparameters(options: argparse.Namespace) -> int:
 
 
 def _doctor(options: argparse.Namespace) -> int:
+    if not options.json:
+        print(versions_as_text(), flush=True)  # at once, whatever may fail or be compiled after it
     findings = examine()
     print(json.dumps(findings, indent=1) if options.json else as_text(findings, colour=_coloured()))
     return 0 if findings["works"] else FAILURE
@@ -739,9 +750,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if options.analysis:
             _check_output(options)
-            with announced("orbits"):
-                # Compiled here, so that progress bars time the work alone.
-                limit_cycle(OscillatorParameters())
+            # Compiled here, so that progress bars time the work alone.
+            limit_cycle(OscillatorParameters())
         return int(options.run(options))
     except OrbitError as error:
         print(f"sd-friction: {error}", file=sys.stderr)

@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numba
-import numpy as np
+from numba.core.dispatcher import Dispatcher
 
 import sd_friction_env
+from sd_friction_env import kernel
+from sd_friction_env.compilation import NO_FOLDER
 from sd_friction_env.orbits import limit_cycle
 from sd_friction_env.parameters import OscillatorParameters
 from sd_friction_env.policies import PolicyFileError
@@ -42,36 +44,48 @@ def hyperparameter_folder() -> Path:
     return installed if installed.is_dir() else _HERE.parent / "agents" / "hyperparameters"
 
 
+def versions() -> dict[str, str | None]:
+    """Return the versions of the package, of Python and of what the package needs, and the system; at once."""
+    return {
+        "sd_friction_env": sd_friction_env.__version__,
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+        **{name: _version(name) for name in ("gymnasium", "numpy", "scipy", "numba")},
+    }
+
+
 def examine() -> dict[str, Any]:
     """Return what there is, as JSON values.
 
-    ``versions``, ``kernel`` (a limit cycle computed now), ``cache`` of compiled code, ``threads``, ``features`` (by
-    extra: what it is for, what is missing), ``agents`` (by environment, "" or what is wrong), ``hyperparameters``, and
-    ``works``: whether all that is needed without extras does.
+    ``versions``, ``kernel`` (a limit cycle computed now; ``fault``: "" or what was raised instead), ``cache`` of
+    compiled code, ``threads``, ``features`` (by extra: what it is for, what is missing), ``agents`` (by environment, ""
+    or what is wrong), ``hyperparameters``, and ``works``: whether all that is needed without extras does.
     """
-    begun = time.perf_counter()
-    amplitude = limit_cycle(OscillatorParameters()).amplitude
-    first = time.perf_counter() - begun
-    begun = time.perf_counter()
-    limit_cycle(OscillatorParameters())
-    again = time.perf_counter() - begun
+    kernel_findings = _kernel()
     agents = {env_id: _agent_fault(env_id) for env_id in sd_friction_env.ENVIRONMENT_IDS}
-    cache = _cache()
     return {
-        "versions": {
-            "sd_friction_env": sd_friction_env.__version__,
-            "python": platform.python_version(),
-            "system": f"{platform.system()} {platform.machine()}",
-            **{name: _version(name) for name in ("gymnasium", "numpy", "scipy", "numba")},
-        },
-        "kernel": {"amplitude": amplitude, "first_call_seconds": round(first, 3), "seconds": round(again, 6)},
-        "cache": cache,
+        "versions": versions(),
+        "kernel": kernel_findings,
+        "cache": _cache(),
         "threads": {"cores": os.cpu_count(), "numba": numba.get_num_threads()},
         "features": _features(),
         "agents": agents,
         "hyperparameters": str(hyperparameter_folder()),
-        "works": bool(np.isfinite(amplitude)) and not any(agents.values()),
+        "works": not kernel_findings["fault"] and not any(agents.values()),
     }
+
+
+def _kernel() -> dict[str, Any]:
+    """Return the amplitude of the nominal limit cycle, and how long it took the first time and the second."""
+    amplitude, took = float("nan"), []
+    try:
+        for _ in range(2):
+            begun = time.perf_counter()
+            amplitude = limit_cycle(OscillatorParameters()).amplitude
+            took.append(time.perf_counter() - begun)
+    except Exception as fault:  # whatever it is, the rest is to be looked at too
+        return {"fault": f"{type(fault).__name__}: {fault}"}
+    return {"fault": "", "amplitude": amplitude, "first_call_seconds": round(took[0], 3), "seconds": round(took[1], 6)}
 
 
 def _version(name: str) -> str | None:
@@ -90,14 +104,16 @@ def _agent_fault(env_id: str) -> str:
 
 
 def _cache() -> dict[str, Any]:
-    """Return where numba keeps what it compiled of ours."""
-    folder = Path(os.environ["NUMBA_CACHE_DIR"]) if os.environ.get("NUMBA_CACHE_DIR") else _HERE / "__pycache__"
-    files = list(folder.rglob("kernel.*.nb[ic]"))
+    """Return where numba keeps what it compiled of ours: the folder it uses, or None and the reason."""
+    is_compiled = isinstance(kernel.settle, Dispatcher)
+    folder = kernel.settle.stats.cache_path if is_compiled else None
+    reason = NO_FOLDER if is_compiled else "nothing is compiled: NUMBA_DISABLE_JIT is set"
+    files = list(Path(folder).glob("kernel.*.nb[ic]")) if folder is not None else []
     return {
-        "folder": str(folder),
+        "folder": folder,
+        "reason": "" if folder is not None else reason,
         "files": len(files),
         "megabytes": round(sum(file.stat().st_size for file in files) / 1e6, 1),
-        "writable": os.access(folder, os.W_OK),
     }
 
 
@@ -119,21 +135,27 @@ def _features() -> dict[str, dict[str, Any]]:
     return {name: found[name] for name in _FEATURES if name in found}
 
 
+def versions_as_text() -> str:
+    """Return :func:`versions` as lines for people."""
+    return "\n".join(f"{name:16} {version}" for name, version in versions().items())
+
+
 def as_text(findings: dict[str, Any], *, colour: bool = False) -> str:
-    """Return findings of :func:`examine` as lines for people."""
+    """Return findings of :func:`examine` as lines for people, without the versions."""
 
     def mark(good: bool, text: str) -> str:
         return f"\x1b[{32 if good else 33}m{text}\x1b[0m" if colour else text
 
-    kernel, cache, threads = (findings[part] for part in ("kernel", "cache", "threads"))
-    took = f"{1e3 * kernel['seconds']:.2f} ms (first call {kernel['first_call_seconds']:.2f} s)"
-    lines = [f"{name:16} {version}" for name, version in findings["versions"].items()]
-    lines += [
-        f"{'kernel':16} limit cycle of amplitude {kernel['amplitude']:.10f} in {took}",
-        f"{'compiled code':16} {cache['files']} files, {cache['megabytes']} MB, in {cache['folder']}",
-    ]
-    if not cache["writable"]:
-        lines.append(mark(False, f"{'':16} not writable: every process compiles anew; set NUMBA_CACHE_DIR"))
+    found, cache, threads = (findings[part] for part in ("kernel", "cache", "threads"))
+    if found["fault"]:
+        lines = [mark(False, f"{'kernel':16} {found['fault']}")]
+    else:
+        took = f"{1e3 * found['seconds']:.2f} ms (first call {found['first_call_seconds']:.2f} s)"
+        lines = [f"{'kernel':16} limit cycle of amplitude {found['amplitude']:.10f} in {took}"]
+    if cache["folder"] is None:
+        lines.append(mark(False, f"{'compiled code':16} {cache['reason']}"))
+    else:
+        lines.append(f"{'compiled code':16} {cache['files']} files, {cache['megabytes']} MB, in {cache['folder']}")
     lines += [
         f"{'threads':16} {threads['cores']} cores, numba uses up to {threads['numba']}",
         f"{'hyperparameters':16} {findings['hyperparameters']}",

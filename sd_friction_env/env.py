@@ -30,7 +30,6 @@ from sd_friction_env.parameters import (
 )
 from sd_friction_env.rendering import checked_size
 from sd_friction_env.simulation import amplitude
-from sd_friction_env.startup import announced
 from sd_friction_env.task import FloatArray, IntegerArray, Task, rig_arguments, steps_before_last_quarter
 
 RewardFunction = Callable[[Mapping[str, Any]], float]
@@ -231,8 +230,7 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         self.render_mode = render_mode
         self.render_size = checked_size(render_size)
         self.reward = reward
-        with announced("orbits"):
-            self.task = task.with_scales(self.nominal)
+        self.task = task.with_scales(self.nominal)
         sees = (task.sensor == "state") + (task.sensor == "state" and task.actuator == "belt_speed")
         sees += 2 * len(EXCITATIONS) if task.show_phases else 0
         shows = len(task.randomise) if task.show_parameters else 0
@@ -294,8 +292,7 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         return cls(parameters, **rig, **arguments)
 
     def _look_into_memory(self) -> None:
-        with announced("one environment"):
-            arrays = kernel.arrays_in(self._memory)
+        arrays = kernel.arrays_in(self._memory)
         self._numbers, self._codes, self._state, self._integers, self._past, self._shown = arrays
         self._seen = self._observations[0]
 
@@ -354,8 +351,7 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         if "parameters" in options:
             parameters = parameters.replace(**options["parameters"])
             check_belt(parameters)
-        with announced("starts"):
-            x, v = start_of(task, parameters, options, key, episode)
+        x, v = start_of(task, parameters, options, key, episode)
         self._key = key
         self._codes[kernel.T_EPISODE_STEPS] = limit
         self._codes[kernel.T_LATE_STEPS] = steps_before_last_quarter(limit)

@@ -1,18 +1,20 @@
 """The explorer: a page in the browser that shows the oscillator live; ``sd-friction explore`` (extra "explore").
 
 :class:`Live` is what moves, without any page; :class:`Page` puts it into a Bokeh document, and :func:`serve` offers
-that to browsers. Bokeh's own server, and nothing on top of it: it streams points over one socket, its widgets answer
-within a few milliseconds, and the page loads nothing from elsewhere.
+that to browsers: by Bokeh's own server, which streams points over one socket and loads nothing from elsewhere. Who may
+ask it is decided in :mod:`sd_friction_env.explorer_server`.
 """
 
 import contextlib
 import dataclasses
+import functools
+import html
 import importlib.metadata
-import socket
 import time
+import webbrowser
 from collections import deque
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,8 +32,8 @@ from sd_friction_env.policies import ConstantPolicy, Policy, State, VelocityFeed
 from sd_friction_env.pretrained import load_pretrained
 
 HOST = "127.0.0.1"
-EVERYWHERE = "0.0.0.0"
 PORT = 5006
+SESSIONS, MOST_SESSIONS = 8, 1000  # pages at a time, unless said otherwise, and at most
 TASKS = {"force": "Force", "belt": "BeltSpeed"}
 OFF, FEEDBACK, AGENT, ROBUST, HAND = "off", "velocity feedback", "trained agent", "trained agent, robust", "by hand"
 PLUGINS = "sd_friction_env.controllers"  # group of entry points: functions from an environment's id to a policy
@@ -66,6 +68,8 @@ _TRAIL, _HISTORY = 200, 600  # control intervals shown
 _LAP = 100  # control intervals of which the amplitude is taken: a little more than a cycle of the nominal plant
 _TICK = 60  # milliseconds between frames
 _TICKS_A_READING = 4
+_IDLE_TICKS = 30_000  # half an hour in which nobody touches a page
+_SLOW_TICKS = 10  # work that takes longer is announced
 _LEAST_SAVED = 0.02  # a step
 BASIN_VIEW = ((-1.6, 1.6), (-1.2, 1.2))  # starts in x and in v
 _CURVE_SPEEDS = np.linspace(0.005, 0.6, 48)
@@ -165,7 +169,13 @@ class Live:
             self.restart(keep=True)
 
     def steer(self, action: float) -> None:
-        """Set what is done by hand, an action in [-1, 1]."""
+        """Set what is done by hand, an action in [-1, 1].
+
+        Raises:
+            ValueError: if it is not a number.
+        """
+        if np.isnan(action):
+            raise ValueError(f"action must be in [-1, 1], got {action!r}")
         self.hand = float(np.clip(action, -1.0, 1.0))
         if self.controller == HAND:
             self.rider.policy = ConstantPolicy(self.hand)
@@ -176,8 +186,12 @@ class Live:
         Raises:
             ValueError: if they do not fit together; nothing is then changed.
         """
-        self.parameters = self.parameters.replace(**values)
-        self.restart(keep=True)
+        before, self.parameters = self.parameters, self.parameters.replace(**values)
+        try:
+            self.restart(keep=True)
+        except ValueError:
+            self.parameters = before
+            raise
 
     def restart(self, *, keep: bool = False) -> None:
         """Begin again on the passive cycle, or from where the mass is now."""
@@ -221,19 +235,82 @@ class Live:
         now, without, agent = self.costs().values()
         return (without - now) / (without - agent) if without > agent + _LEAST_SAVED else float("nan")
 
-    # What does not move
 
-    def cycle(self) -> LimitCycle | None:
-        """Return the passive limit cycle, without excitation; None if there is none that can be named."""
-        try:
-            return limit_cycle(self.parameters.unexcited)
-        except OrbitError:
-            return None
+# What does not move ---------------------------------------------------------------------------------------------------
 
-    def curve(self, speeds: NDArray[np.float64] = _CURVE_SPEEDS) -> dict[str, NDArray[np.float64]]:
-        """Return belt speeds and passive amplitudes, without excitation, NaN where there is none."""
-        table = amplitude_curve(self.parameters.unexcited, speeds)
-        return {"belt_speed": table["belt_speed"], "amplitude": table["amplitude"]}
+
+def passive_cycle(parameters: OscillatorParameters) -> LimitCycle | None:
+    """Return the passive limit cycle, without excitation; None if there is none that can be named."""
+    try:
+        return limit_cycle(parameters.unexcited)
+    except OrbitError:
+        return None
+
+
+def passive_curve(
+    parameters: OscillatorParameters, speeds: NDArray[np.float64] = _CURVE_SPEEDS
+) -> dict[str, NDArray[np.float64]]:
+    """Return belt speeds and passive amplitudes, without excitation, NaN where there is none."""
+    table = amplitude_curve(parameters.unexcited, speeds)
+    return {"belt_speed": table["belt_speed"], "amplitude": table["amplitude"]}
+
+
+@functools.cache
+def _compile_steps(is_beyond: bool) -> None:
+    """Compile what an episode of such plants calls, so that no page waits for it in the server's own thread."""
+    Live(parameters=OscillatorParameters(friction="coulomb" if is_beyond else "stribeck")).advance(1)
+
+
+@dataclass(frozen=True)
+class PlantPicture:
+    """What the page shows of a plant that does not move: the amplitude over the belt speed, and the limit cycle."""
+
+    parameters: OscillatorParameters
+    curve: dict[str, NDArray[np.float64]]
+    cycle: LimitCycle | None
+
+    @classmethod
+    def of(cls, parameters: OscillatorParameters) -> "PlantPicture":
+        """Compute it."""
+        _compile_steps(parameters.beyond)
+        return cls(parameters, passive_curve(parameters), passive_cycle(parameters))
+
+
+class Latest:
+    """Work in the background of which only the newest request counts.
+
+    At most one piece of work runs and at most one waits; a newer request takes the place of the one that waits.
+    Nothing happens but in :meth:`poll`, so that a page is touched by the server's own thread alone.
+
+    Args:
+        show: is given the future of each piece of work that is done. executor: runs it (a thread of its own).
+    """
+
+    def __init__(self, show: Callable[[Future[Any]], None], executor: Executor | None = None) -> None:
+        self.show = show
+        self.executor = executor or ThreadPoolExecutor(1)  # compiled code lets the server go on meanwhile
+        self.waiting: Callable[[], Any] | None = None
+        self.running: Future[Any] | None = None
+        self.polls = 0  # since the running work began
+
+    def ask(self, work: Callable[[], Any]) -> None:
+        """Have this done next, and nothing that was asked for before and has not begun."""
+        self.waiting = work
+
+    def poll(self) -> None:
+        """Show what is done, and begin what waits."""
+        self.polls += 1
+        if self.running is not None and self.running.done():
+            done, self.running = self.running, None
+            self.show(done)
+        if self.running is None and self.waiting is not None:
+            work, self.waiting, self.polls = self.waiting, None, 0
+            self.running = self.executor.submit(work)
+
+    def end(self) -> None:
+        """Forget what waits; what runs is not shown any more."""
+        self.waiting = self.running = None
+        self.executor.shutdown(wait=False, cancel_futures=True)
 
 
 def basin_picture(parameters: OscillatorParameters) -> tuple[NDArray[np.float64], str]:
@@ -275,9 +352,17 @@ table { border-collapse: collapse; } td { padding: 1px 14px 1px 0; }
 
 
 class Page:
-    """One browser's page: its own oscillator, its widgets, and a tick that moves both on."""
+    """One browser's page: its own oscillator, its widgets, and a tick that moves both on.
 
-    def __init__(self, document: Any) -> None:
+    The widgets are what the user asks for. Their events do no work: each tick looks at what they show by then, so
+    that of many moves the last one counts. What takes longer than a frame is done in the background, one piece of each
+    kind at a time.
+
+    Args:
+        document: that the page is drawn into. on_idle: is called when nobody has touched the page for half an hour.
+    """
+
+    def __init__(self, document: Any, on_idle: Callable[[], None] = lambda: None) -> None:
         from bokeh.layouts import column, row
         from bokeh.models import (
             Button,
@@ -292,9 +377,14 @@ class Page:
             Toggle,
         )
 
-        self.document = document
-        self.pool = ThreadPoolExecutor(1)  # compiled code lets the server go on meanwhile
+        self.document, self.on_idle = document, on_idle
         self.live = Live()
+        self.plant = self.live.parameters  # asked for; that of the oscillator as soon as its picture is there
+        self.plant_work = Latest(self._show_plant)
+        self.basin_work = Latest(self._show_basins)
+        self.ended = False
+        self.idle_ticks = 0
+        self.clicked: set[str] = set()  # buttons, since the last tick
         self.style = InlineStyleSheet(css=_STYLE)
         self.speed = 4  # control intervals a tick
         self.geometry = Select(options=list(GEOMETRIES), value=self.live.parameters.geometry, title="geometry")
@@ -326,25 +416,18 @@ class Page:
         }
         self.sliders["belt_speed"].format = "0.000"
         self.plant_widgets: dict[str, Any] = {**self.sliders, "geometry": self.geometry, "friction": self.friction}
-        for widget in self.plant_widgets.values():
-            widget.on_change("value", self._moved)
-        self.is_general_warm = False  # the laws beyond the paper's are compiled when first used
-        self.several = False  # widgets are being set together
         self.task = RadioButtonGroup(labels=["push the mass (force)", "drive the belt"], active=1, name="task")
-        self.task.on_change("active", self._task_changed)
         self.controller = Select(options=controllers(), value=OFF, title="controller", name="controller")
-        self.controller.on_change("value", self._controller_changed)
         self.hand = Slider(title="by hand: action", start=-1, end=1, step=0.05, value=0, name="hand")
-        self.hand.on_change("value", self._steered)
         pushes = [Button(label=label, name=f"hand {value}") for label, value in (("◀ -1", -1), ("0", 0), ("+1 ▶", 1))]
         for button, value in zip(pushes, (-1.0, 0.0, 1.0), strict=True):
             button.on_click(lambda value=value: self._take_over(value))
         restart = Button(label="squeal again", button_type="primary", name="restart")
-        restart.on_click(self._restarted)
+        restart.on_click(lambda: self.clicked.add("restart"))
         nominal = Button(label="nominal plant", name="nominal")
         nominal.on_click(self._nominal)
         basins = Button(label="basins", name="basins button")
-        basins.on_click(self._show_basins)
+        basins.on_click(lambda: self.clicked.add("basins"))
         self.pause = Toggle(label="pause", name="pause")
         self.readout = Div(name="readout", stylesheets=[self.style], width=330, height=160)
         self.message = Div(name="message", stylesheets=[self.style], width=500)
@@ -380,8 +463,10 @@ class Page:
         right = column(self._history(), self._amplitudes())
         document.add_root(column(title, row(left, middle, right, spacing=12)))
         document.title = "sd_friction_env explorer"
-        self._plant_changed()
-        document.add_periodic_callback(self.tick, _TICK)
+        self.requests = self._requests()
+        self._draw_plant(PlantPicture.of(self.plant))
+        self.ticking = document.add_periodic_callback(self.tick, _TICK)
+        document.on_session_destroyed(lambda context: self.end())
 
     # Figures
 
@@ -455,19 +540,44 @@ class Page:
 
     # What the user does
 
-    def _moved(self, attribute: str, old: Any, new: Any) -> None:
-        if self.several:
-            return
-        with self._said():
-            # All that the widgets show, for what was refused before may now fit.
-            plant = self.live.parameters.replace(**{name: widget.value for name, widget in self.plant_widgets.items()})
-            if plant.beyond and not self.is_general_warm:
-                self.is_general_warm = True
-                self.message.text = "This law is compiled when first used: it may take half a minute ..."
-                self.document.add_next_tick_callback(lambda: self._moved(attribute, old, new))
-                return
-            self.live.change(**dataclasses.asdict(plant))
-            self._plant_changed()
+    def _requests(self) -> dict[str, Any]:
+        """Return what the widgets ask for now."""
+        shown = {name: widget.value for name, widget in self.plant_widgets.items()}
+        return shown | {"task": self.task.active, "controller": self.controller.value, "hand": self.hand.value}
+
+    def _follow(self) -> None:
+        """Do what the widgets ask for now, and not what they asked for in between."""
+        before, self.requests = self.requests, self._requests()
+        changed = {name for name, value in self.requests.items() if value != before[name]}
+        clicked, self.clicked = self.clicked, set()
+        self.idle_ticks = 0 if changed or clicked else self.idle_ticks + 1
+        if changed & self.plant_widgets.keys():
+            with self._said():
+                # All that the widgets show, for what was refused before may now fit.
+                self.plant = self.plant.replace(**{name: self.requests[name] for name in self.plant_widgets})
+                self.plant_work.ask(functools.partial(PlantPicture.of, self.plant))
+        if "task" in changed:
+            with self._said():
+                self.live.choose_task(dict(enumerate(TASKS)).get(self.task.active, self.live.task))
+                self._clear()
+            self._tell_missing()
+        if "hand" in changed:
+            self.controller.value = self.requests["controller"] = HAND
+            with self._said():
+                self.live.steer(self.hand.value)
+        if self.controller.value != self.live.controller:
+            with self._said():
+                self.live.choose_controller(self.controller.value)
+                self._clear()
+            self._tell_missing()
+        if "restart" in clicked:
+            with self._said():
+                self.live.restart()
+                self._clear()
+        if "basins" in clicked:
+            self.message.text = "The basins are being computed ..."
+            plant = self.plant
+            self.basin_work.ask(lambda: (plant, *basin_picture(plant)))
 
     @contextlib.contextmanager
     def _said(self) -> Any:
@@ -475,69 +585,46 @@ class Page:
         self.message.text = ""
         try:
             yield
-        except (ValueError, OrbitError) as error:
-            self.message.text = f"<div class='warn'>{error}</div>"
+        except (ValueError, TypeError, OrbitError) as error:
+            self._warn(str(error))
 
-    def _task_changed(self, attribute: str, old: int, new: int) -> None:
-        with self._said():
-            self.live.choose_task(list(TASKS)[new])
-            self._clear()
-        self._tell_missing()
-
-    def _controller_changed(self, attribute: str, old: str, new: str) -> None:
-        with self._said():
-            self.live.choose_controller(new)
-            self._clear()
-        self._tell_missing()
+    def _warn(self, text: str) -> None:
+        self.message.text = f"<div class='warn'>{html.escape(text)}</div>"
 
     def _tell_missing(self) -> None:
         chosen = self.live.controller
         if chosen in self.live.missing:
-            self.message.text = f"<div class='warn'>{self.live.missing[chosen]}</div>"
-
-    def _steered(self, attribute: str, old: float, new: float) -> None:
-        if self.controller.value != HAND:
-            self.controller.value = HAND
-        self.live.steer(new)
+            self._warn(self.live.missing[chosen])
 
     def _take_over(self, value: float) -> None:
-        if self.controller.value != HAND:
-            self.controller.value = HAND
-        self.hand.value = value
-        self.live.steer(value)
-
-    def _restarted(self) -> None:
-        with self._said():
-            self.live.restart()
-            self._clear()
+        self.controller.value, self.hand.value = HAND, value
 
     def _nominal(self) -> None:
         nominal = OscillatorParameters()
-        self.several = True
         for name, widget in self.plant_widgets.items():
             widget.value = getattr(nominal, name)
-        self.several = False
-        with self._said():
-            self.live.change(**dataclasses.asdict(nominal))
-            self._plant_changed()
 
-    def _show_basins(self) -> None:
-        plant = self.live.parameters
-        self.message.text = "The basins are being computed ..."
-        work = self.pool.submit(basin_picture, plant)
-        work.add_done_callback(
-            lambda done: self.document.add_next_tick_callback(lambda: self._basins_there(plant, done))
-        )
-
-    def _basins_there(self, plant: OscillatorParameters, work: Future[tuple[NDArray[np.float64], str]]) -> None:
-        if plant != self.live.parameters:  # it has been changed meanwhile
-            return
+    def _show_plant(self, work: Future[PlantPicture]) -> None:
         with self._said():
-            image, words = work.result()
+            picture = work.result()
+            self.live.change(**dataclasses.asdict(picture.parameters))
+            self._draw_plant(picture)
+
+    def _show_basins(self, work: Future[tuple[OscillatorParameters, NDArray[np.float64], str]]) -> None:
+        with self._said():
+            plant, image, words = work.result()
+            if plant != self.plant:  # it has been changed meanwhile
+                return
             (x, x_end), (v, v_end) = BASIN_VIEW
             self._look(0.0, x_end, v_end)
             self.basins.data = {"image": [image], "x": [x], "y": [v], "dw": [x_end - x], "dh": [v_end - v]}
             self.message.text = words
+
+    def end(self) -> None:
+        """Stop all work: the browser has left, or nobody has touched the page for long."""
+        self.ended = True
+        self.plant_work.end()
+        self.basin_work.end()
 
     # What follows
 
@@ -550,10 +637,10 @@ class Page:
         for values in self.past.values():
             values.clear()
 
-    def _plant_changed(self) -> None:
-        """Show the curve, the cycle and the stick line of the plant as it is now."""
-        self.curve.data = self.live.curve()
-        cycle = self.live.cycle()
+    def _draw_plant(self, picture: PlantPicture) -> None:
+        """Show the curve and the cycle of a plant."""
+        self.curve.data = picture.curve
+        cycle = picture.cycle
         shape = cycle.points if cycle is not None and cycle.amplitude > 0.0 else np.empty((0, 2))
         place = cycle.x_max if cycle is not None else 0.8
         low = cycle.x_min if cycle is not None else -0.8
@@ -568,7 +655,20 @@ class Page:
         self._clear()
 
     def tick(self) -> None:
-        """Let a little time pass, and show it."""
+        """Do what the user asks for; let a little time pass, and show it."""
+        if self.ended:
+            if self.idle_ticks > _IDLE_TICKS:  # a tick later, so that the browser has got the message
+                self.on_idle()
+            return
+        self._follow()
+        for work in (self.plant_work, self.basin_work):
+            work.poll()
+        if self.plant_work.running is not None and self.plant_work.polls == _SLOW_TICKS:
+            self.message.text = "This plant is being computed; a law that is used for the first time is compiled ..."
+        if self.idle_ticks > _IDLE_TICKS:
+            self.message.text = "Ended, for nobody has touched this page for half an hour: reload it to go on."
+            self.end()
+            return
         if self.pause.active:
             return
         live = self.live
@@ -637,38 +737,39 @@ class Page:
         self.marks.data = {"x": -1.6 + (places + 1.6 + travel) % 3.5, "y": np.full(len(places), -0.16)}
 
 
-def serve(host: str = HOST, port: int = PORT, *, browser: bool = True, say: Callable[[str], None] = print) -> None:
+def serve(
+    host: str = HOST,
+    port: int = PORT,
+    *,
+    allowed: Iterable[str] = (),
+    sessions: int = SESSIONS,
+    browser: bool = True,
+    say: Callable[[str], None] = print,
+) -> None:
     """Offer the explorer until interrupted.
 
     Args:
         host: address to listen at; others than this machine can come only if it is not a loopback address.
-        port: 0: any that is free. browser: open one. say: is told the page's address.
+        port: 0: any that is free. allowed: further names that a request may be for, see
+            :func:`sd_friction_env.explorer_server.served_hosts`. sessions: pages at a time, at least 1.
+        browser: open one. say: is told the page's address.
 
     Raises:
-        ImportError: if Bokeh is not installed. OSError: if the port is taken.
+        ImportError: if Bokeh is not installed. OSError: if the port is taken. ValueError: if a name is none.
     """
     require_bokeh()
-    from bokeh.application import Application
-    from bokeh.application.handlers.function import FunctionHandler
-    from bokeh.server.server import Server
+    from sd_friction_env.explorer_server import make_server
 
+    server, address = make_server(host, port, allowed, sessions)
     # Compiled before the first page asks for it.
-    live = Live()
-    live.advance(2)
-    live.curve()
+    PlantPicture.of(OscillatorParameters())
     begun = time.perf_counter()
-    live.curve()
+    passive_curve(OscillatorParameters())
     took = time.perf_counter() - begun
-    with socket.create_server((host, port)) as free:  # a taken one is told here, before anything starts
-        port = free.getsockname()[1]
-    # Pages of other sites must not drive the explorer of somebody who only looks at them.
-    places = ["*"] if host == EVERYWHERE else [f"{host}:{port}", f"localhost:{port}"]
-    server = Server({"/": Application(FunctionHandler(Page))}, address=host, port=port, allow_websocket_origin=places)
-    address = f"http://{'localhost' if host == EVERYWHERE else host}:{server.port}/"
     server.start()
     say(f"The explorer is at {address} (a curve takes {1e3 * took:.0f} ms); Ctrl-C ends it.")
     if browser:
-        server.io_loop.add_callback(server.show, "/")
+        server.io_loop.add_callback(webbrowser.open, address)
     try:
         server.io_loop.start()
     except KeyboardInterrupt:

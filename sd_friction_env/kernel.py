@@ -1,5 +1,5 @@
-# All compiled code of the project stands in this one file. numba's on-disk cache watches only the file that defines a
-# function: a law changed in another file would leave the old force in use, silently.
+# All compiled code of the project stands in this one file. The on-disk cache watches only the file that defines a
+# function (and compilation.py): a law changed in another file would leave the old force in use, silently.
 """The oscillator's laws, its slip/stick automaton and the event-exact step, compiled once and cached.
 
 Everything is dimensionless (physics of the paper's Eqs. 4-10). Plain scalars go in and come out, nothing is raised:
@@ -20,10 +20,7 @@ import numba
 import numba.extending
 import numpy as np
 
-compiled = numba.njit(cache=True, error_model="numpy", nogil=True)
-# For what stands in a loop over lanes: only without a call left in it does such a loop become vector instructions.
-in_threads = numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-in_lanes = numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+from sd_friction_env.compilation import compiled, in_lanes, in_threads
 
 EXACT, CUBIC, LINEAR, DUFFING, DISCONTINUOUS = 0, 1, 2, 3, 4
 STRIBECK, COULOMB, HYPERBOLIC, EXPONENTIAL = 0, 1, 2, 3

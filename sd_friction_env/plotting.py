@@ -1,8 +1,8 @@
 """Figures drawn from tables and histories, readable in grey; needs matplotlib (extra "plot")."""
 
+import contextlib
 import os
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sd_friction_env.basins import Basins
 from sd_friction_env.forced import ForcedBasins
 from sd_friction_env.simulation import Trajectory
-from sd_friction_env.tables import Table, atomic_file
+from sd_friction_env.tables import Table, atomic_file, checked_ending
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,16 +35,38 @@ FAMILY = (
 CONTROLLED = ({"marker": "o", "color": GREEN}, {"marker": "s", "color": VERMILION}, {"marker": "^", "color": BLACK})
 
 
+FORMATS = (".png", ".svg", ".pdf")
+
+
+@contextlib.contextmanager
+def house_style() -> Iterator[None]:
+    """Draw in matplotlib's own style within the block, or the function that this decorates.
+
+    What the user's matplotlibrc asks for may not be there: LaTeX, a font. What else draws into our figures does so in
+    this style too.
+
+    Raises:
+        ImportError: if matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise ImportError('figures need matplotlib: pip install "sd-friction-env[plot]"') from error
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams["svg.hashsalt"] = "sd_friction_env"  # the names in an .svg do not change from run to run
+        yield
+
+
+@house_style()
 def new_figure(width: float, height: float, rows: int, columns: int, **arguments: Any) -> tuple["Figure", Any]:
     """Return a figure (inches) and its axes, an array of shape (rows, columns), without touching a display.
 
     Raises:
         ImportError: if matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('figures need matplotlib: pip install "sd-friction-env[plot]"') from error
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **arguments)
     for axis in axes.flat:
@@ -54,18 +76,20 @@ def new_figure(width: float, height: float, rows: int, columns: int, **arguments
     return figure, axes
 
 
+@house_style()
 def save_figure(figure: "Figure", path: str | os.PathLike[str], dpi: int = 150) -> None:
     """Write a figure, whole or not at all, with nothing in the file that changes from run to run.
 
     Raises:
-        OSError: if the file cannot be written.
+        ValueError: if the name ends in none of ``FORMATS``. OSError: if the file cannot be written.
     """
-    path = Path(path)
-    stamp = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}.get(path.suffix)
+    ending = checked_ending(path, FORMATS, "a figure's path")
+    stamp = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}[ending]
     with atomic_file(path, "wb") as file:
-        figure.savefig(file, format=path.suffix[1:], dpi=dpi, metadata={stamp: None} if stamp else None)
+        figure.savefig(file, format=ending[1:], dpi=dpi, metadata={stamp: None})
 
 
+@house_style()
 def draw_amplitude_curve(axis: "Axes", curve: Table, column: str = "amplitude") -> None:
     """Draw one curve over the belt speed, a line for each kind of motion."""
     for kind, style in BRANCHES.items():
@@ -74,6 +98,7 @@ def draw_amplitude_curve(axis: "Axes", curve: Table, column: str = "amplitude") 
             axis.plot(curve["belt_speed"], shown, **style)  # type: ignore[arg-type]
 
 
+@house_style()
 def draw_family_member(axis: "Axes", curve: Table, column: str, label: str, style: Mapping[str, str]) -> None:
     """Draw one curve of several: solid in stick-slip, dashed in pure slip, with a few markers to tell it in grey."""
     for kind, line in (("stick-slip", "-"), ("pure-slip", (0, (3, 1)))):
@@ -90,6 +115,7 @@ def draw_family_member(axis: "Axes", curve: Table, column: str, label: str, styl
         )
 
 
+@house_style()
 def mark_critical_speeds(axis: "Axes", v_b0: float, v_b1: float) -> None:
     """Mark v_b0 and v_b1 with their values; the names stand to the left and right of the pair."""
     marks = ((v_b0, "right", rf"$v_{{b0}} = {v_b0:.4f}$ "), (v_b1, "left", rf" $v_{{b1}} = {v_b1:.4f}$"))
@@ -100,12 +126,14 @@ def mark_critical_speeds(axis: "Axes", v_b0: float, v_b1: float) -> None:
             axis.text(speed, 0.99 * top, label, rotation=90, va="top", ha=side, fontsize=8, color="0.3")
 
 
+@house_style()
 def draw_controlled_points(axis: "Axes", series: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> None:
     """Lay closed-loop amplitudes over a passive curve: (belt speeds, amplitudes) by name."""
     for style, (name, (speeds, amplitudes)) in zip(CONTROLLED, series.items(), strict=False):
         axis.plot(speeds, amplitudes, linestyle="none", markersize=5.5, markeredgecolor="white", label=name, **style)  # type: ignore[arg-type]
 
 
+@house_style()
 def draw_before_and_after(histories: Mapping[str, Trajectory], switched_on: float, title: str) -> "Figure":
     """Draw displacement, velocity and phase portrait of controlled histories, control starting at ``switched_on``.
 
@@ -136,6 +164,7 @@ def draw_before_and_after(histories: Mapping[str, Trajectory], switched_on: floa
     return figure
 
 
+@house_style()
 def draw_amplitude_table(table: Table, members: Sequence[Mapping[str, Any]]) -> "Figure":
     """Draw the curves of a sweep: one by its branches, several as a family, attractors as points.
 
@@ -170,6 +199,7 @@ def draw_amplitude_table(table: Table, members: Sequence[Mapping[str, Any]]) -> 
     return figure
 
 
+@house_style()
 def draw_history(history: Trajectory) -> "Figure":
     """Draw displacement, velocity and phase portrait of one history, stick phases marked."""
     figure, axes = new_figure(11.0, 3.2, 1, 3, width_ratios=(2.2, 2.2, 1.6))
@@ -188,6 +218,7 @@ def draw_history(history: Trajectory) -> "Figure":
     return figure
 
 
+@house_style()
 def draw_basins(axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], found: Basins) -> None:
     """Draw a grid of basins with the attractors on it.
 
@@ -223,6 +254,7 @@ def draw_basins(axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], fo
     axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=4, frameon=False)
 
 
+@house_style()
 def draw_bifurcation(axis: "Axes", diagram: Table) -> None:
     """Draw the section points of :func:`sd_friction_env.forced.bifurcation_diagram`, the way up under the way down."""
     for way, color, size in (("up", BLACK, 1.6), ("down", VERMILION, 0.5)):
@@ -241,6 +273,7 @@ def draw_bifurcation(axis: "Axes", diagram: Table) -> None:
     axis.legend(fontsize=8, frameon=False, loc="upper right")
 
 
+@house_style()
 def draw_exponents(axis: "Axes", table: Table, floor: float = -0.25) -> None:
     """Draw the largest exponent over the value of a sweep, with two standard errors; below ``floor`` it is cut off."""
     for way, color, width, line in (("up", BLACK, 1.6, "-"), ("down", VERMILION, 1.0, (0, (4, 1.2)))):
@@ -255,6 +288,7 @@ def draw_exponents(axis: "Axes", table: Table, floor: float = -0.25) -> None:
     axis.set_ylabel(r"largest exponent $\lambda$")
 
 
+@house_style()
 def draw_section(axis: "Axes", section: Table) -> None:
     """Draw a stroboscopic section, :func:`sd_friction_env.forced.poincare_section`, its stuck states apart."""
     stuck = section["mode"] == 0
@@ -273,6 +307,7 @@ def draw_section(axis: "Axes", section: Table) -> None:
     axis.legend(fontsize=8, frameon=False)
 
 
+@house_style()
 def draw_forced_basins(axis: "Axes", found: ForcedBasins) -> None:
     """Draw a grid of forced basins with the section points of the periodic attractors on it."""
     from matplotlib.colors import BoundaryNorm, ListedColormap

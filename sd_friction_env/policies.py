@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.orbits import equilibria
 from sd_friction_env.parameters import checked_number
-from sd_friction_env.tables import atomic_file
+from sd_friction_env.tables import atomic_file, checked_ending
 
 Actions = NDArray[np.float32]
 State = tuple[NDArray[Any], ...] | None
@@ -541,8 +541,7 @@ class NetworkPolicy:
             ValueError: if the name does not end in .npz. OSError: if the file cannot be written.
         """
         target = Path(path)
-        if target.suffix != ".npz":
-            raise ValueError(f"path must end in .npz, got {os.fspath(path)!r}")
+        checked_ending(target, (".npz",))
         header = {
             "kind": _NETWORK_KIND,
             "format": NETWORK_FORMAT,

@@ -3,7 +3,7 @@
 import contextlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -93,6 +93,20 @@ def _cell(value: Any) -> str:
     if isinstance(value, str):
         return '"' + value.replace('"', '""') + '"' if any(mark in value for mark in ',"\n') else value
     return repr(value)
+
+
+def checked_ending(path: str | os.PathLike[str], endings: Sequence[str], name: str = "path") -> str:
+    """Return the ending of a file's name, in lower case.
+
+    Raises:
+        ValueError: if it is none of ``endings``; ``name`` is what the message calls the path.
+    """
+    ending = Path(path).suffix.lower()
+    if ending not in endings:
+        *others, last = endings
+        known = f"{', '.join(others)} or {last}" if others else last
+        raise ValueError(f"{name} must end in {known}, got {os.fspath(path)!r}")
+    return ending
 
 
 @contextlib.contextmanager

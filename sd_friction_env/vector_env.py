@@ -49,7 +49,6 @@ from sd_friction_env.parameters import (
     checked_count,
     law_numbers,
 )
-from sd_friction_env.startup import announced
 from sd_friction_env.task import EPISODE_STEPS, PHASE_SLOT, FloatArray, IntegerArray, passive_motion
 from sd_friction_env.theory import stribeck_coefficients
 
@@ -328,10 +327,9 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         else:
             self._stepper = kernel.STEPPERS[self.nominal.geometry_code]
             self._stepper_in_threads = kernel.STEPPERS_IN_THREADS[self.nominal.geometry_code]
-        self._is_warm = False
 
     def __getstate__(self) -> dict[str, Any]:
-        anew = ("_stepper", "_stepper_in_threads", "_is_warm", "_kept", "_all", "_masks")
+        anew = ("_stepper", "_stepper_in_threads", "_kept", "_all", "_masks")
         return {name: value for name, value in vars(self).items() if name not in anew}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -496,12 +494,11 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
             return
         own = starts.own[columns]
         left = columns[own]
-        with announced("starts in a batch"):
-            beyond = kernel.NO_LAWS if starts.beyond else None
-            kernel.place_on_cycle(state, integers, columns[~own], *self._nominal_start, beyond)
-            if task.start == "cycle":
-                phases = task.phases(keys, episodes)[own]
-                left = left[kernel.own_cycle_starts(state, integers, left, phases, beyond) == 1]
+        beyond = kernel.NO_LAWS if starts.beyond else None
+        kernel.place_on_cycle(state, integers, columns[~own], *self._nominal_start, beyond)
+        if task.start == "cycle":
+            phases = task.phases(keys, episodes)[own]
+            left = left[kernel.own_cycle_starts(state, integers, left, phases, beyond) == 1]
         for j in left.tolist():
             single = self._as_parameters(starts.numbers[:, j], _kinds(state, integers, j))
             key, episode = integers[[kernel.I_KEY, kernel.I_EPISODE], j].tolist()
@@ -690,10 +687,6 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
             self._observations,
             *out,
         )
-        if not self._is_warm:
-            with announced("step of a batch"):
-                self._is_warm = True
-                return self._advance(actions, out)
         if len(self._works) == 1 or _threads_are_lost:
             ended: int = self._stepper(self._works[0], 0, self.num_envs, *arguments)
             return ended

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env.env import SDFrictionEnv
 from sd_friction_env.policies import Policy, State, ZeroPolicy
+from sd_friction_env.tables import checked_ending
 
 FORMATS = (".gif", ".mp4")
 MOST_STEPS = 100_000
@@ -85,18 +86,16 @@ def check_video_path(path: str | os.PathLike[str], fps: int = 30) -> Path:
             second: at most 60, and 50 of a GIF (what players keep to).
         ImportError: if what writes it is not installed.
     """
-    target = Path(path)
-    if target.suffix.lower() not in FORMATS:
-        raise ValueError(f"the video's name must end in {' or '.join(FORMATS)}, got {os.fspath(path)!r}")
+    target, ending = Path(path), checked_ending(path, FORMATS, "the video's name")
     if target.is_dir() or not target.parent.is_dir():
         raise ValueError(f"the video must be a file in a folder that exists, got {os.fspath(path)!r}")
-    fastest, kind = (50, " for a GIF") if target.suffix.lower() == ".gif" else (60, "")
+    fastest, kind = (50, " for a GIF") if ending == ".gif" else (60, "")
     if not 1 <= fps <= fastest:
         raise ValueError(f"fps must be in [1, {fastest}]{kind}, got {fps!r}")
     try:
         import imageio  # noqa: F401
 
-        if target.suffix.lower() == ".mp4":
+        if ending == ".mp4":
             import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
         raise ImportError(f'videos need {error.name}: pip install "sd-friction-env[video]"') from None
@@ -122,11 +121,12 @@ def write_video(
     target = check_video_path(path, fps)
     import imageio.v2 as imageio
 
-    unfinished = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+    ending = target.suffix.lower()  # as imageio knows it
+    unfinished = target.with_name(f".{target.stem}.{os.getpid()}{ending}")
     # A GIF keeps its frames small by few colours; the pictures have few.
     options: dict[str, Any] = (
         {"duration": 1000.0 / fps, "loop": 0, "subrectangles": True, "palettesize": 32}
-        if target.suffix.lower() == ".gif"
+        if ending == ".gif"
         else {"fps": fps, "macro_block_size": 2, "codec": "libx264", "quality": 7, "ffmpeg_log_level": "error"}
     )
     try:

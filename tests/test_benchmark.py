@@ -307,7 +307,7 @@ def test_a_peer_that_breaks_is_told_with_its_last_word(tmp_path, monkeypatch):
         (["--out", "nowhere/result.json"], "--out 'nowhere/result.json' lies in no existing folder"),
         (["--plot", "nowhere/result.png"], "--plot 'nowhere/result.png' lies in no existing folder"),
         (["--out", "."], "--out '.' is a folder"),
-        (["--plot", "result.gif"], r"--plot must end in .png, .pdf or .svg, got 'result.gif'"),
+        (["--plot", "result.gif"], r"--plot must end in .png, .svg or .pdf, got 'result.gif'"),
         (["--peers", "nowhere/python"], "--peers must be a Python 3 interpreter"),
         (["--rounds", "0"], "--rounds must be a whole number of at least 1, got 0"),
         (["--steps", "-3"], "--steps must be a whole number of at least 1, got -3"),

@@ -141,8 +141,8 @@ def test_the_script_writes_the_packages_agent_and_a_run(tmp_path, capsys):
     assert out.read_bytes() == before
     file = str(pretrained_file(FORCE))
     assert script.main([file, "--task", "force", "--out", str(out), "--force", *small]) == 0
-    assert script.main(["agents/pretrained/force-nominal-ppo-0", "--out", str(tmp_path / "b.onnx"), *small]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["agent.onnx", "b.onnx"]
+    assert script.main(["agents/pretrained/force-nominal-ppo-0", "--out", str(tmp_path / "b.ONNX"), *small]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["agent.onnx", "b.ONNX"]
 
 
 def test_a_model_that_differs_is_not_written(tmp_path, monkeypatch, capsys):

@@ -1,0 +1,234 @@
+"""Compiled code: kept, checked before it is believed, and told about only when something is compiled."""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sd_friction_env
+from sd_friction_env import OscillatorParameters, compilation, kernel, limit_cycle
+
+pytestmark = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="nothing is compiled")
+
+PACKAGE = Path(sd_friction_env.__file__).parent
+NOWHERE = "/dev/null/nowhere"  # below a file nobody can make a folder, not even root
+SOURCE = """
+from sd_friction_env.compilation import compiled
+
+@compiled
+def add(x):
+    return x + 1
+
+@compiled
+def twice(x):
+    return 2 * add(x)
+"""
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """Return a module with two compiled functions, not yet compiled, whose cache is beside it."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(compilation, "_said", set())
+    (tmp_path / "tiny.py").write_text(SOURCE)
+    return loaded(tmp_path / "tiny.py")
+
+
+def loaded(path):
+    specification = importlib.util.spec_from_file_location(path.stem, path)
+    made = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(made)
+    sys.modules[path.stem] = made  # numba pickles by name
+    return made
+
+
+def again(module):
+    """Return the module's functions as another process has them: nothing of them is compiled."""
+    return loaded(Path(module.__file__))
+
+
+def files(module, ending):
+    return sorted(Path(module.twice.stats.cache_path).glob(f"tiny.*.{ending}"))
+
+
+def hits(function):
+    return sum(function.stats.cache_hits.values()), sum(function.stats.cache_misses.values())
+
+
+def test_what_is_compiled_is_kept_and_loaded(module):
+    assert module.twice(3) == 8
+    assert hits(module.twice) == (0, 1)
+    other = again(module)
+    assert other.twice(3) == 8
+    assert hits(other.twice) == (1, 0)
+    assert len(files(module, "nbi")) == len(files(module, "nbc")) == 2
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+def test_a_damaged_file_costs_a_compilation_and_a_line_that_names_it(module, ending, capsys, monkeypatch):
+    assert module.twice(3) == 8
+    (file,) = (file for file in files(module, ending) if "twice" in file.name)
+    whole = file.read_bytes()
+    places = range(0, len(whole), max(1, len(whole) // 40))
+    flipped = [whole[:i] + bytes([whole[i] ^ 1 << i % 8]) + whole[i + 1 :] for i in places]
+    for damaged in (*flipped, b"", whole[:1], whole[:-1], whole[: len(whole) // 2], whole + b"x", b"\0" * len(whole)):
+        file.write_bytes(damaged)
+        monkeypatch.setattr(compilation, "_said", set())
+        other = again(module)
+        assert other.twice(3) == 8
+        assert hits(other.twice) == (0, 1)
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert f"{str(file)!r} of compiled code is damaged: compiled anew" in error
+        mended = again(module)
+        assert mended.twice(3) == 8
+        assert hits(mended.twice) == (1, 0)
+        assert capsys.readouterr().err == ""
+
+
+def test_what_cannot_be_read_or_written_is_no_obstacle(module, capsys):
+    assert module.twice(3) == 8
+    for file in (*files(module, "nbi"), *files(module, "nbc")):
+        file.unlink()
+        file.mkdir()
+    other = again(module)
+    assert other.twice(3) == 8
+    first, second = capsys.readouterr().err.splitlines()
+    assert "compiled anew" in first
+    assert "cannot be kept" in second
+    shutil.rmtree(Path(module.twice.stats.cache_path))
+    Path(module.twice.stats.cache_path).write_text("a file in the folder's place")
+    assert module.twice(3.5) == 9.0  # for a type it is not compiled for yet
+
+
+def test_a_file_of_another_signature_function_or_source_is_not_taken_for_it(module):
+    """As two processes leave it that compile at once, and one that was ended between its two files."""
+    assert module.twice(3) == 8
+    assert module.twice(3.5) == 9.0
+    one, other = (file for file in files(module, "nbc") if "twice" in file.name)
+    adding = next(file for file in files(module, "nbc") if "add" in file.name)
+    code_of_one = one.read_bytes()
+    for wrong in (other.read_bytes(), adding.read_bytes()):
+        one.write_bytes(wrong)
+        third = again(module)
+        assert (third.twice(3), third.twice(3.5)) == (8, 9.0)
+        assert hits(third.twice) == (1, 1)
+        assert hits(again(module).twice) == (0, 0)
+    Path(module.__file__).write_text(SOURCE.replace("x + 1", "x + 2"))
+    changed = again(module)
+    assert changed.twice(3) == 10
+    one.write_bytes(code_of_one)  # its index is of the new source
+    assert again(module).twice(3) == 10
+
+
+def test_an_edit_of_the_decorators_renews_the_code(module, monkeypatch):
+    assert module.twice(3) == 8
+    monkeypatch.setattr(compilation, "_OWN_SOURCE", b"other options")
+    other = again(module)
+    assert other.twice(3) == 8
+    assert hits(other.twice) == (0, 1)
+
+
+def test_only_what_is_compiled_is_announced_once_and_with_the_seconds(module, capsys, monkeypatch):
+    monkeypatch.setattr(compilation, "_PATIENCE", 0.0)
+    monkeypatch.setattr(compilation, "_SECONDS_PER_BYTE", 1.0)
+    assert module.twice(3) == 8
+    bytecode = sum(len(f.py_func.__code__.co_code) for f in (module.twice, module.add))
+    said = "sd_friction_env: compiling {}, about {} s (once) ...\n"
+    assert capsys.readouterr().err == said.format("twice", bytecode)  # add within it
+    other = again(module)
+    assert other.twice(3) == 8
+    assert capsys.readouterr().err == ""  # however long it takes
+    assert other.add(3.5) == 4.5
+    assert capsys.readouterr().err == said.format("add", len(module.add.py_func.__code__.co_code))
+    monkeypatch.setattr(compilation, "_PATIENCE", 1e9)
+    assert other.twice(3.5) == 9.0
+    assert capsys.readouterr().err == ""  # over before it is read
+
+
+def test_the_announcement_of_the_kernel_counts_what_it_calls():
+    limit_cycle(OscillatorParameters())
+    assert len(list(compilation._bytecode_to_compile(kernel.settle))) > 30
+
+
+def run(code, folder, **environment):
+    paths = os.pathsep.join([str(folder), str(PACKAGE.parent)])
+    command = [sys.executable, *code] if isinstance(code, list) else [sys.executable, "-c", code]
+    return subprocess.Popen(
+        command,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": paths, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_processes_that_compile_at_once_give_and_leave_what_is_right(tmp_path):
+    (tmp_path / "tiny.py").write_text(SOURCE)
+    values = ["3", "3.5", "np.float32(3)", "np.arange(3.0)"]
+    code = "import sys, numpy as np, tiny; sys.stdin.read(1); print(np.sum(tiny.twice({})), file=sys.stdout)"
+    for _ in range(2):  # cold, then what the first round has left
+        running = [run(code.format(value), tmp_path, NUMBA_CACHE_DIR="") for value in values]
+        told = [process.communicate(timeout=120) for process in running]
+        assert [float(out) for out, _ in told] == [8.0, 9.0, 8.0, 12.0]
+        assert [error for _, error in told] == [""] * 4
+
+
+def test_without_a_folder_for_it_everything_works_and_one_line_says_what_to_set(tmp_path):
+    (tmp_path / "tiny.py").write_text(SOURCE)
+    (tmp_path / "__pycache__").write_text("a file")
+    nowhere = {"HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE, "NUMBA_CACHE_DIR": NOWHERE}
+    process = run("import tiny; print(tiny.twice(3), tiny.add(3.5), tiny.twice.stats.cache_path)", tmp_path, **nowhere)
+    out, error = process.communicate(timeout=120)
+    assert out == "8 4.5 None\n"
+    assert error == f"sd_friction_env: {compilation.NO_FOLDER}\n"
+    assert "NUMBA_CACHE_DIR" in error
+
+
+def copied(tmp_path, *, with_cache):
+    limit_cycle(OscillatorParameters())  # compiled, if it was not
+    left = shutil.ignore_patterns() if with_cache else shutil.ignore_patterns("__pycache__")
+    shutil.copytree(PACKAGE, tmp_path / "sd_friction_env", ignore=left)
+    if (PACKAGE.parent / "agents" / "hyperparameters").is_dir():
+        shutil.copytree(PACKAGE.parent / "agents" / "hyperparameters", tmp_path / "agents" / "hyperparameters")
+    return tmp_path / "sd_friction_env"
+
+
+def test_the_doctor_works_without_a_folder_for_compiled_code(tmp_path):
+    package = copied(tmp_path, with_cache=False)
+    (package / "__pycache__").write_text("a file")
+    nowhere = {"HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE, "NUMBA_CACHE_DIR": NOWHERE}
+    process = run(["-m", "sd_friction_env", "doctor"], tmp_path, **nowhere)
+    assert process.stdout.readline().split() == ["sd_friction_env", sd_friction_env.__version__]  # before it compiles
+    out, error = process.communicate(timeout=600)
+    assert process.returncode == 0, error
+    assert "limit cycle of amplitude 0.3934432611" in out
+    assert f"compiled code    {compilation.NO_FOLDER}" in out
+    assert error.count("NUMBA_CACHE_DIR") == 1
+    assert "compiling settle, about" in error
+
+
+def test_the_doctor_works_with_damaged_files_and_names_the_folder_in_use(tmp_path):
+    package = copied(tmp_path, with_cache=True)
+    folder = package / "__pycache__" if os.environ.get("NUMBA_CACHE_DIR") is None else None
+    if folder is None or not list(folder.glob("kernel.*.nbc")):
+        pytest.skip("the cache of these tests is elsewhere")
+    damaged = [*folder.glob("kernel.stick_slip_lap-*.nbc"), *folder.glob("kernel.slip_across-*.nbi")]
+    assert len(damaged) >= 2
+    for file in damaged:
+        file.write_bytes(file.read_bytes()[:-100])
+    process = run(["-m", "sd_friction_env", "doctor", "--json"], tmp_path)
+    out, error = process.communicate(timeout=600)
+    assert process.returncode == 0, error
+    found = json.loads(out)
+    assert found["kernel"]["amplitude"] == limit_cycle(OscillatorParameters()).amplitude
+    assert found["cache"]["folder"] == str(folder)
+    assert found["cache"]["files"] == len(list(folder.glob("kernel.*.nb[ic]")))
+    assert error.count("damaged") == 1
+    assert str(folder) in error

@@ -1538,7 +1538,8 @@ def _advance(plant, mode, x, v, v_belt, a_belt, u, duration, events, known):
     end = later(plant, t)
     x = room_x(end, x)
     v = room_v(end, v)
-    return x, v, belt, mode, status, t, n_events, int_v2, stick_time, int_fv, x_min, x_max
+    # A ripple's phase is rounded otherwise there.
+    return x, v, belt, mode, status, t, n_events, int_v2, stick_time, int_fv, min(x_min, x), max(x_max, x)
 
 
 @compiled
@@ -1603,7 +1604,7 @@ def excitation_work(plant, x, v, v_belt, a_belt, u, duration, events):
     t = 0.0
     for n in range(len(events) + 1):
         end = events[n, 0] if n < len(events) else duration
-        pieces = int((end - t) / 0.05) + 1
+        pieces = int((end - t) / _short_of_excitation(plant.laws, 0.5, 0.05)) + 1
         length = (end - t) / pieces
         for _ in range(pieces if length > 0.0 else 0):
             # Each node is reached from the piece's beginning, so that no error adds up.

@@ -11,14 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env import kernel
 from sd_friction_env.orbits import (
+    ContactLossError,
     LimitCycle,
     OrbitError,
-    ReturnMap,
     attractors,
     equilibria,
-    limit_cycle,
+    limit_of_motion,
+    limits_of_slip,
     same_motion,
     stick_intervals,
+    traps_of,
 )
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_number
 
@@ -70,34 +72,39 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
         checked_number(name, float(worst), -STATE_LIMIT, STATE_LIMIT)
     found = list(attractors(parameters))
 
-    def label_of(cycle: LimitCycle) -> int:
-        for i, known in enumerate(found):
-            if same_motion(cycle, known):
-                return i
-        found.append(cycle)
-        return len(found) - 1
+    def label_of(cycle: LimitCycle | None) -> int:
+        alike = (i for i, known in enumerate(found) if cycle is not None and same_motion(cycle, known))
+        return next(alike, UNDECIDED)
 
     exits, exit_labels = [], []
     for _, right in stick_intervals(parameters):
         exits.append(right)
         try:
-            exit_labels.append(label_of(limit_cycle(parameters, right, parameters.belt_speed)))
-        except OrbitError:
+            exit_labels.append(label_of(limit_of_motion(parameters, right, parameters.belt_speed)))
+        except ContactLossError:
             exit_labels.append(LOST_CONTACT)
-    places = equilibria(parameters)
-    decided = [_decided_radii(parameters, place.x, found) for place in places]
-    width = max((len(rows) for rows in decided), default=0) + 1
+        except OrbitError:
+            exit_labels.append(UNDECIDED)
+    traps = traps_of(parameters)
+    trap_labels = [label_of(limit_of_motion(parameters, place, 0.0)) for place in traps[:, kernel.TRAP_X].tolist()]
+    decided = {
+        centre: [(radius, label_of(cycle)) for radius, cycle in rows] for centre, rows in limits_of_slip(parameters)
+    }
+    places = [place.x for place in equilibria(parameters)]
+    width = max(map(len, decided.values()), default=0) + 1
     bounds = np.full((len(places), width), np.inf)
     bound_labels = np.full((len(places), width), UNDECIDED, dtype=np.int64)
-    for i, rows in enumerate(decided):
-        for j, (bound, label) in enumerate(rows):
+    for i, place in enumerate(places):
+        for j, (bound, label) in enumerate(decided.get(place, [])):
             bounds[i, j], bound_labels[i, j] = bound, label
     labels = np.empty(xs.size, dtype=np.int8)
     flat_x, flat_v = np.ascontiguousarray(xs).ravel(), np.ascontiguousarray(vs).ravel()
     known = (
-        np.array(exits),
+        np.array(exits, dtype=np.float64),
         np.array(exit_labels, dtype=np.int64),
-        np.array([place.x for place in places]),
+        traps,
+        np.array(trap_labels, dtype=np.int64),
+        np.array(places, dtype=np.float64),
         bounds,
         bound_labels,
     )
@@ -114,35 +121,6 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(classify, itertools.starmap(slice, itertools.pairwise(edges))))
     return Basins(attractors=tuple(found), labels=labels.reshape(xs.shape), parameters=parameters)
-
-
-def _decided_radii(parameters: OscillatorParameters, centre: float, found: list[LimitCycle]) -> list[tuple[float, int]]:
-    """Return (bound, label) pairs: maxima of x between the last bound and this, from the centre, tend there."""
-    laps = ReturnMap(parameters, centre, centre)
-    radii, last = laps.cycles()
-
-    def label_at(radius: float) -> int:
-        for i, cycle in enumerate(found):
-            if cycle.kind in ("pure-slip", "steady-slip") and abs(cycle.x_max - centre - radius) < 1e-6:
-                return i
-        return UNDECIDED
-
-    if last == 0.0:  # no lap: a saddle, or a node that is crept into
-        return [(0.0, label_at(0.0))]
-    # Between neighbouring fixed points (the equilibrium is one, of radius 0) all maxima move the same way.
-    fixed = [0.0, *radii]
-    rows = []
-    for inner, outer in zip(fixed, [*radii, last], strict=True):
-        if not outer > inner:
-            continue
-        grows = laps.shift(0.5 * (inner + outer)) > 0.0
-        if not grows:
-            rows.append((outer, label_at(inner)))
-        elif outer != last or outer in radii:
-            rows.append((outer, label_at(outer)))
-        else:
-            rows.append((outer, UNDECIDED))
-    return rows
 
 
 def basin_grid(

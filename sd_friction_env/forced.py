@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env import kernel
-from sd_friction_env.orbits import OrbitError, equilibria, limit_cycle
+from sd_friction_env.orbits import OrbitError, equilibria, limit_cycle, traps_of
 from sd_friction_env.parameters import EXCITATIONS, RANGES, STATE_LIMIT, OscillatorParameters, checked_number
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.tables import Table
@@ -468,6 +468,8 @@ def _passive_exponent(parameters: OscillatorParameters, x: float, v: float | Non
         place = min(equilibria(parameters), key=lambda e: abs(e.x - cycle.x_max))
         parts = sorted((value.real for value in place.eigenvalues), reverse=True)
         largest, exponents = parts[0], (parts[0], parts[1])
+    elif cycle.kind == "neutral":
+        largest, exponents = 0.0, (0.0, 0.0)
     elif cycle.kind == "rest":
         largest, exponents = 0.0, (0.0, -math.inf)
     else:
@@ -579,7 +581,7 @@ def _section_at(
             xs, vs, stuck = rows[:, kernel.R_X], rows[:, kernel.R_V], rows[:, kernel.R_STICK_TIME] / period
         else:
             places = np.empty(transient + cycles)
-            status, written = kernel.maxima(_plant(plant), *state, plant.belt_speed, places)
+            status, written = kernel.maxima(_plant(plant), *state, plant.belt_speed, places, traps_of(plant))
             if status != kernel.OK:
                 raise _lost(plant, *state, status, written)
             xs, vs, stuck = places[transient:], np.zeros(cycles), np.full(cycles, math.nan)

@@ -138,9 +138,7 @@ def check_basins(seed: int, starts: int) -> tuple[int, int, list[dict[str, Any]]
             rest.append({"seed": (seed, plant_number), "verdict": "slow", "why": f"{lasted:.3g} s", "p": p})
         for (x, v), label in zip(np.clip(places, -10, 10).tolist(), found.labels.tolist(), strict=True):
             verdict = follow(p, x, v, found, label)
-            what = verdict.what
-            if label == UNDECIDED and what != "not settled":
-                what = "undecided"
+            what = "undecided" if label == UNDECIDED else verdict.what
             held += what == "held"
             if what != "held":
                 rest.append({"seed": (seed, plant_number), "verdict": what, "why": verdict.why, "p": p, "x": x, "v": v, "label": label,

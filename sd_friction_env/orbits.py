@@ -29,6 +29,7 @@ _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are cal
 _FINEST_RATIO = 1.15  # of neighbouring radii at which a return map is sampled
 _LAP_ERROR = 1e-13  # of a return map, relative to max(1, |x|): what is less is rounding
 _MOST_SETTLINGS = 200
+_LEVEL, _LEVEL_STEP = 1e-9, 1e-4  # where a spring's stiffness is less, the force this far away says more
 _BELT_SPEED_ERROR = 1e-11  # v_b0 is given this much too low: on the very graze rounding decides whether a cycle sticks
 
 
@@ -51,6 +52,16 @@ class Equilibrium:
     x: float
     eigenvalues: tuple[complex, complex]
     stable: bool
+
+    @property
+    def stiffness(self) -> float:
+        """Of small deviations, the product of the eigenvalues."""
+        return (self.eigenvalues[0] * self.eigenvalues[1]).real
+
+    @property
+    def damping(self) -> float:
+        """Of small deviations, minus the sum of the eigenvalues."""
+        return -(self.eigenvalues[0] + self.eigenvalues[1]).real
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,20 +258,35 @@ def traps_of(parameters: OscillatorParameters) -> FloatArray:
     """
     rows = []
     for e in equilibria(parameters):
-        if not (e.stable or (conserves_energy(parameters) and is_centre(e))):
+        centre = is_centre(parameters, e)
+        stable = centre and e.damping > 0.0
+        if not stable and not (centre and conserves_energy(parameters)):
             continue
-        ball, slope, extents = _SMALLEST_RADIUS * max(1.0, abs(e.x)), 0.0, (0.0, 0.0)
-        if e.eigenvalues[0].imag == 0.0 and e.stable:
-            slope = -0.5 * (e.eigenvalues[0].real + e.eigenvalues[1].real)
-            farthest = 4.0 * (STATE_LIMIT + abs(e.x))
-            extents = kernel.trap_extents(parameters.plant, parameters.belt_speed, e.x, slope, 0.1 * ball, farthest)
-        rows.append((e.x, ball, slope, *extents))
+        ball, level = ball_of(e), e.stiffness <= _LEVEL
+        rows.append((e.x, ball, 0.0, 0.0, 0.0))
+        if stable and e.eigenvalues[0].imag == 0.0:
+            # Of all lines the first asks for the least damping far out, the second lets the spring grow stiffest.
+            for slope in (math.sqrt(max(e.stiffness, 0.0)), 0.5 * e.damping)[level:]:
+                nearest, farthest = _LEVEL_STEP if level else 0.1 * ball, 4.0 * (STATE_LIMIT + abs(e.x))
+                extents = kernel.trap_extents(parameters.plant, parameters.belt_speed, e.x, slope, nearest, farthest)
+                rows.append((e.x, ball, slope, *extents))
     return np.array(rows, dtype=np.float64).reshape(len(rows), kernel.TRAP_ROW)
 
 
-def is_centre(equilibrium: Equilibrium) -> bool:
-    """Whether slip turns about an equilibrium or creeps into it, which a saddle's does not."""
-    return (equilibrium.eigenvalues[0] * equilibrium.eigenvalues[1]).real > 0.0
+def ball_of(equilibrium: Equilibrium) -> float:
+    """Return how small orbits about an equilibrium are that are called the equilibrium."""
+    return _SMALLEST_RADIUS * max(1.0, abs(equilibrium.x))
+
+
+def is_centre(parameters: OscillatorParameters, equilibrium: Equilibrium) -> bool:
+    """Whether forces lead back to an equilibrium from both sides, so that slip can turn about it or creep into it."""
+    if abs(equilibrium.stiffness) > _LEVEL:
+        return equilibrium.stiffness > 0.0
+    plant, belt, x = parameters.plant, parameters.belt_speed, equilibrium.x
+    left, right = (
+        kernel.slip_forces(plant, kernel.SLIP_BACKWARD, x + side * _LEVEL_STEP, 0.0, belt, 0.0)[0] for side in (-1, 1)
+    )
+    return bool(left > 0.0 > right)
 
 
 def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | None = None) -> LimitCycle:
@@ -303,8 +329,8 @@ def limit_of_motion(parameters: OscillatorParameters, x: float, v: float) -> Lim
         if conserved and _is_neutral(parameters, place):
             return _pure_slip(parameters, place, x, v, "neutral")
         around = [e for e in equilibria(parameters) if lowest <= e.x <= place]
-        dissipates = _slip_dissipates(parameters)
-        if abs(place - previous) < kernel.TIME_ZERO and place - lowest > _SMALLEST_RADIUS and not dissipates:
+        repeats = abs(place - previous) < kernel.TIME_ZERO and place - lowest > _SMALLEST_RADIUS
+        if repeats and not (around and _drifts_past(parameters, place, around[-1])):
             return _pure_slip(parameters, place, x, v)
         if not around:
             at_x, at_v, laps = place, 0.0, _LONG_SETTLING_LAPS
@@ -389,7 +415,8 @@ class ReturnMap:
         )
         if event != kernel.TURNING or not 0.0 < following - self.centre < self.farthest or not low <= self.centre:
             return None, math.nan
-        return (bisect.bisect_left(self.places, low), forward_arcs), float(following - self.centre - radius)
+        arcs = 0 if self.parameters.mu_s == 0.0 else forward_arcs  # without friction the belt's speed parts nothing
+        return (bisect.bisect_left(self.places, low), arcs), float(following - self.centre - radius)
 
     def shift(self, radius: float, kind: LapKind | None) -> float:
         """Return how much one lap of this kind (None: of any) adds to a radius, NaN if there is none."""
@@ -426,6 +453,14 @@ class ReturnMap:
         """Whether a shift is more than rounding."""
         return abs(shift) > _LAP_ERROR * max(1.0, abs(self.centre + radius))
 
+    def first_resolved(self, radius: float, kind: LapKind | None) -> float:
+        """Return the shift of the first orbit from a radius outwards of which it is more than rounding, or NaN."""
+        shift = self.shift(radius, kind)
+        while not (math.isnan(shift) or self.resolved(radius, shift)):
+            radius *= 1.5
+            shift = self.shift(radius, kind)
+        return shift
+
     def samples(self) -> list[tuple[float, LapKind | None, float]]:
         """Return radii, ascending, with their laps: up to beyond all that starts can reach."""
         top = 0.05
@@ -439,7 +474,7 @@ class ReturnMap:
         if math.isfinite(self.farthest):
             edge = self.farthest * (1.0 - np.geomspace(1e-6, 0.1, 12))
             fine = sorted(radius for radius in {*fine, *edge.tolist()} if 0.0 < radius < self.farthest)
-        return [(radius, *self.lap(radius)) for radius in fine]
+        return [(radius, *self.lap(radius)) for radius in fine if radius > 1.5 * ball_of(self.equilibrium)]
 
     def reach(self, top: float) -> float:
         """Return a radius beyond all that starts in range can reach in slip."""
@@ -486,11 +521,10 @@ class ReturnMap:
             first = 0
             if low == 0.0 and not self.is_weak:
                 # The equilibrium is a fixed point too: its linearisation says what rounding hides of small orbits.
-                first = -1 if self.equilibrium.stable else 1
-                unlike = next((radius for radius, shift in known if shift * first < 0.0), None)
-                like = [r for r, shift in inside if shift * first > 0.0 and unlike is not None and r < unlike]
-                if known and known[0][1] * first < 0.0 and like:
-                    cycles.insert(0, self.root(kind, like[-1], known[0][0]))
+                first = -1 if self.equilibrium.damping > 0.0 else 1
+                if known and known[0][1] * first < 0.0:
+                    like = [radius for radius, shift in inside if radius < known[0][0] and shift * first > 0.0]
+                    cycles = [self.root(kind, like[-1], known[0][0]), *cycles] if like else cycles
         except _NoLapError as gap:
             inner = max(radius for radius, _ in inside if radius < gap.radius)
             outer = min(radius for radius, _ in inside if radius > gap.radius)
@@ -500,8 +534,10 @@ class ReturnMap:
             return self.parted(kind, low, below) + self.parted(kind, begin, above)
         tendencies = []
         for inner, outer in itertools.pairwise([low, *cycles, high]):
-            greatest = max((shift for radius, shift in known if inner <= radius <= outer), key=abs, default=0.0)
-            tendencies.append(int(np.sign(greatest)))
+            between = [shift for radius, shift in known if inner < radius < outer]
+            if not between and inner in cycles and outer in cycles:  # a pair close together
+                between = [self.shift(0.5 * (inner + outer), kind)]
+            tendencies.append(int(np.sign(max(between, key=abs, default=0.0))))
         if tendencies[0] == 0:
             tendencies[0] = first
         return [LapRange(ends=(low, high), cycles=tuple(cycles), tendencies=tuple(tendencies), kind=kind)]
@@ -509,8 +545,7 @@ class ReturnMap:
     @property
     def is_weak(self) -> bool:
         """Whether the equilibrium's linearisation is neutral, so that its curvature decides."""
-        first, second = self.equilibrium.eigenvalues
-        return abs((first + second).real) <= 1e-13 * abs(first)
+        return abs(self.equilibrium.damping) <= 1e-13 * max(abs(value) for value in self.equilibrium.eigenvalues)
 
     def cycles(self, kind: LapKind | None, known: list[tuple[float, float]]) -> list[float]:
         """Return the radii of cycles among samples (radius, shift) of one kind of lap.
@@ -547,15 +582,27 @@ def sections(parameters: OscillatorParameters) -> list[Section]:
     """Return the section of every equilibrium that slip can turn about, in ascending order."""
     found = []
     for equilibrium in equilibria(parameters):
-        if not is_centre(equilibrium):
+        if not is_centre(parameters, equilibrium):
             continue
         laps = ReturnMap(parameters, equilibrium)
         ranges = laps.ranges()
-        attracts = equilibrium.stable
+        attracts = equilibrium.damping > 0.0
         if laps.is_weak:
             attracts = bool(ranges) and ranges[0].ends[0] == 0.0 and ranges[0].tendencies[0] < 0
         found.append(Section(equilibrium, attracts, ranges))
     return found
+
+
+def _drifts_past(parameters: OscillatorParameters, place: float, centre: Equilibrium) -> bool:
+    """Whether maxima on both sides of one that repeats but for rounding move the same way, so that it is no cycle."""
+    if _slip_dissipates(parameters):
+        return True
+    laps = ReturnMap(parameters, centre)
+    radii = [(place - centre.x) * (1.0 + part) for part in (-0.01, 0.01)]
+    below, above = ((radius, laps.shift(radius, None)) for radius in radii)
+    if math.isnan(below[1] + above[1]):  # one of them sticks: the cycle touches the belt's speed
+        return False
+    return not (below[1] * above[1] < 0.0 and laps.resolved(*below) and laps.resolved(*above))
 
 
 def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: list[Equilibrium]) -> tuple[str, float]:
@@ -568,10 +615,13 @@ def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: lis
     kind, shift = laps.lap(radius)
     if kind is None:
         return "on", maximum
+    if not laps.resolved(radius, shift):
+        # Of small orbits, lost in rounding, the equilibrium's linearisation says what they do, or greater ones.
+        shift = -around[-1].damping if not laps.is_weak else laps.first_resolved(radius, kind)
     contracts = _slip_dissipates(parameters)
     growing = shift > 0.0 and not contracts
     factor = 1.2 if growing else 0.5
-    while _SMALLEST_RADIUS < radius < laps.reach(0.0):
+    while (growing or factor * radius > 2.0 * ball_of(around[-1])) and radius < laps.reach(0.0):
         following, last = factor * radius, False
         while True:
             change = laps.shift(following, kind)
@@ -579,7 +629,7 @@ def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: lis
                 # Up to the last orbit with a lap there can still be a cycle; if there is none, the motion passes it.
                 following, last = laps.edge(kind, radius, following), True
                 change = laps.shift(following, kind)
-            if (change > 0.0) == growing or contracts:
+            if (change > 0.0) == growing or contracts or not laps.resolved(following, change):
                 break
             try:
                 return "pure-slip", centre + laps.root(kind, radius, following)
@@ -693,8 +743,11 @@ def same_motion(a: LimitCycle, b: LimitCycle) -> bool:
     if a.kind != b.kind:
         return False
     if a.kind == "neutral":
-        circled = [[cycle.x_min <= e.x <= cycle.x_max for e in equilibria(a.parameters)] for cycle in (a, b)]
-        return circled[0] == circled[1] and a.forward_arcs == b.forward_arcs
+        places, arcs = [e.x for e in equilibria(a.parameters)], a.parameters.mu_s > 0.0
+        first, second = (
+            ([cycle.x_min <= x <= cycle.x_max for x in places], arcs and cycle.forward_arcs) for cycle in (a, b)
+        )
+        return first == second
     close = 1e-6 * min(1.0, max(1e-3, a.amplitude))
     return abs(a.x_max - b.x_max) < close and abs(a.x_min - b.x_min) < close
 

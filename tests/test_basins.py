@@ -110,11 +110,12 @@ def test_pure_slip_cycles_and_equilibrium_alternate_in_stability():
 
 
 def test_a_pair_of_cycles_about_to_merge_is_not_stepped_over():
-    laps = ReturnMap(EXACT, 0.0, 0.0)
-    laps.shift = lambda r: math.nan if r > 1.0 else -((r - 0.4321) ** 2) + 1e-7  # type: ignore[method-assign]
-    radii, last = laps.cycles()
-    assert radii == pytest.approx([0.4321 - math.sqrt(1e-7), 0.4321 + math.sqrt(1e-7)])
-    assert last == pytest.approx(1.0)
+    laps = ReturnMap(EXACT, equilibria(EXACT)[-1])
+    laps.lap = lambda r: (None, math.nan) if r > 1.0 else ((0, 0), 1e-7 - (r - 0.4321) ** 2)  # type: ignore[method-assign]
+    (found,) = laps.ranges()
+    assert found.cycles == pytest.approx((0.4321 - math.sqrt(1e-7), 0.4321 + math.sqrt(1e-7)))
+    assert found.tendencies == (-1, 1, -1)
+    assert found.ends == (0.0, pytest.approx(1.0))
 
 
 @pytest.mark.parametrize("parameters", [EXACT, CUBIC, EXACT.replace(geometry="linear"), CUBIC.replace(mu_m=0.14)])

@@ -27,6 +27,7 @@ from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checke
 LOST_CONTACT, UNDECIDED = -1, -2
 
 _STARTS_WORTH_A_THREAD = 20_000
+_SAMPLED_MAXIMA = 15  # among those with which motions leave a range of radii
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,7 +37,7 @@ class Basins:
     Attributes:
         attractors: as :func:`sd_friction_env.orbits.attractors` lists them.
         labels: index into ``attractors`` of each start, of the shape of the starts; -1: the mass loses contact,
-            -2: not decided.
+            -2: not decided. A start on a neutral orbit has the index of its family, an entry of kind "neutral".
         parameters: of the oscillator.
     """
 
@@ -87,16 +88,14 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
             exit_labels.append(UNDECIDED)
     traps = traps_of(parameters)
     trap_labels = [label_of(limit_of_motion(parameters, place, 0.0)) for place in traps[:, kernel.TRAP_X].tolist()]
-    decided = {
-        centre: [(radius, label_of(cycle)) for radius, cycle in rows] for centre, rows in limits_of_slip(parameters)
-    }
     places = [place.x for place in equilibria(parameters)]
-    width = max(map(len, decided.values()), default=0) + 1
+    limits = {places.index(centre): rows for centre, rows in limits_of_slip(parameters)}
+    width = max(map(len, limits.values()), default=0) + 1
     bounds = np.full((len(places), width), np.inf)
     bound_labels = np.full((len(places), width), UNDECIDED, dtype=np.int64)
-    for i, place in enumerate(places):
-        for j, (bound, label) in enumerate(decided.get(place, [])):
-            bounds[i, j], bound_labels[i, j] = bound, label
+    for i, rows in limits.items():
+        bounds[i, : len(rows)] = [row.radius for row in rows]
+        bound_labels[i, : len(rows)] = [label_of(row.cycle) for row in rows]
     labels = np.empty(xs.size, dtype=np.int8)
     flat_x, flat_v = np.ascontiguousarray(xs).ravel(), np.ascontiguousarray(vs).ravel()
     known = (
@@ -109,17 +108,37 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
         bound_labels,
     )
 
-    def classify(part: slice) -> None:
-        kernel.classify(parameters.plant, parameters.belt_speed, flat_x[part], flat_v[part], *known, labels[part])
+    def classify(x: NDArray[np.float64], v: NDArray[np.float64], into: NDArray[np.int8]) -> None:
+        kernel.classify(parameters.plant, parameters.belt_speed, x, v, *known, into)
+
+    def label_from(low: float, high: float) -> int:
+        """Return the label of all maxima between two places, UNDECIDED if they have not one."""
+        reached = np.empty(_SAMPLED_MAXIMA, dtype=np.int8)
+        classify(np.linspace(low, high, _SAMPLED_MAXIMA + 2)[1:-1], np.zeros(_SAMPLED_MAXIMA), reached)
+        return int(reached[0]) if (reached == reached[0]).all() else UNDECIDED
+
+    # Where all maxima drift out of a range of radii, what follows is known as soon as that of its neighbours is.
+    for _ in range(width):
+        before = bound_labels.copy()
+        for i, rows in limits.items():
+            for j, row in enumerate(rows):
+                if row.leaves is not None and bound_labels[i, j] == UNDECIDED:
+                    low, high = row.leaves
+                    bound_labels[i, j] = label_from(places[i] + low, places[i] + high)
+        if np.array_equal(bound_labels, before):
+            break
+
+    def classify_part(part: slice) -> None:
+        classify(flat_x[part], flat_v[part], labels[part])
 
     # Starts do not know of each other: any number of threads gives the same labels. Few starts are not worth one.
     threads = min(threads or os.cpu_count() or 1, xs.size // _STARTS_WORTH_A_THREAD)
     if threads < 2:
-        classify(slice(None))
+        classify_part(slice(None))
     else:
         edges = np.linspace(0, xs.size, 8 * threads + 1).astype(int).tolist()
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(classify, itertools.starmap(slice, itertools.pairwise(edges))))
+            list(pool.map(classify_part, itertools.starmap(slice, itertools.pairwise(edges))))
     return Basins(attractors=tuple(found), labels=labels.reshape(xs.shape), parameters=parameters)
 
 

@@ -1851,8 +1851,8 @@ def classify(plant, v_belt, xs, vs, exits, exit_labels, traps, trap_labels, cent
 
     A start that sticks is carried to the next of the ``exits`` (ascending) and has its label; one that a trap holds
     has the trap's. A start that slips from a maximum of x less than ``bounds[i, j]`` to the right of ``centres[i]``,
-    the next to its left, has ``bound_labels[i, j]`` for the first such j (rows end with infinite bounds labelled below
-    zero, "not decided yet"). -1: lost contact, -2: not decided.
+    the next to its left, has ``bound_labels[i, j]`` for the first such j (rows end with infinite bounds labelled -2,
+    "not decided yet"). -1: lost contact, -2: not decided.
     """
     for n in range(len(xs)):
         x = xs[n]
@@ -1882,7 +1882,7 @@ def classify(plant, v_belt, xs, vs, exits, exit_labels, traps, trap_labels, cent
                         j = 0
                         while x - centres[nearest] >= bounds[nearest, j]:
                             j += 1
-                        if bound_labels[nearest, j] >= 0:
+                        if bound_labels[nearest, j] != -2:
                             label = bound_labels[nearest, j]
                             break
             else:

@@ -28,7 +28,7 @@ _LONG_SETTLING_LAPS = 800
 _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are called the equilibrium
 _FINEST_RATIO = 1.15  # of neighbouring radii at which a return map is sampled
 _LAP_ERROR = 1e-13  # of a return map, relative to max(1, |x|): what is less is rounding
-_MOST_SETTLINGS = 200
+_MOST_SETTLINGS, _MOST_LAPS = 200, 2000
 _LEVEL, _LEVEL_STEP = 1e-9, 1e-4  # where a spring's stiffness is less, the force this far away says more
 _BELT_SPEED_ERROR = 1e-11  # v_b0 is given this much too low: on the very graze rounding decides whether a cycle sticks
 
@@ -382,12 +382,14 @@ class LapRange:
 
     Attributes:
         ends: the first radius and the last; the first is 0 where the range begins at the equilibrium.
+        after: the radii of the maxima that follow on these.
         cycles: its fixed points between, ascending.
         tendencies: of the maxima between one of these radii and the next: 1 outwards, -1 inwards, 0 not resolved.
         kind: of its laps.
     """
 
     ends: tuple[float, float]
+    after: tuple[float, float]
     cycles: tuple[float, ...]
     tendencies: tuple[int, ...]
     kind: LapKind
@@ -453,6 +455,15 @@ class ReturnMap:
         """Whether a shift is more than rounding."""
         return abs(shift) > _LAP_ERROR * max(1.0, abs(self.centre + radius))
 
+    def leaving(self, radius: float, kind: LapKind) -> float | None:
+        """Return the first radius without a lap of this kind that follows on one, None after too many laps."""
+        for _ in range(_MOST_LAPS):
+            change = self.shift(radius, kind)
+            if math.isnan(change):
+                return radius
+            radius += change
+        return None
+
     def first_resolved(self, radius: float, kind: LapKind | None) -> float:
         """Return the shift of the first orbit from a radius outwards of which it is more than rounding, or NaN."""
         shift = self.shift(radius, kind)
@@ -512,9 +523,10 @@ class ReturnMap:
         """Return the ranges that samples (radius, shift) of one kind of lap belong to: one, but for gaps met on the
         way. ``low`` is where the first begins."""
         high = inside[-1][0]
+        ends, after = (low, high), (low + inside[0][1], high + inside[-1][1])
         if conserves_energy(self.parameters) or _slip_dissipates(self.parameters):
             neutral = conserves_energy(self.parameters) and (kind[1] == 0 or _is_frictionless(self.parameters))
-            return [LapRange(ends=(low, high), cycles=(), tendencies=(0 if neutral else -1,), kind=kind)]
+            return [LapRange(ends=ends, after=after, cycles=(), tendencies=(0 if neutral else -1,), kind=kind)]
         known = [(radius, shift) for radius, shift in inside if self.resolved(radius, shift)]
         try:
             cycles = self.cycles(kind, known)
@@ -540,7 +552,7 @@ class ReturnMap:
             tendencies.append(int(np.sign(max(between, key=abs, default=0.0))))
         if tendencies[0] == 0:
             tendencies[0] = first
-        return [LapRange(ends=(low, high), cycles=tuple(cycles), tendencies=tuple(tendencies), kind=kind)]
+        return [LapRange(ends=ends, after=after, cycles=tuple(cycles), tendencies=tuple(tendencies), kind=kind)]
 
     @property
     def is_weak(self) -> bool:
@@ -611,7 +623,7 @@ def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: lis
     """
     laps = ReturnMap(parameters, around[-1])
     centre = laps.centre
-    radius = maximum - centre
+    first = radius = maximum - centre
     kind, shift = laps.lap(radius)
     if kind is None:
         return "on", maximum
@@ -636,7 +648,9 @@ def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: lis
             except _NoLapError as gap:
                 following = gap.radius
         if last:
-            return "on", centre + following * (1.0 + (1e-12 if growing else -1e-12))
+            beyond = following * (1.0 + (1e-12 if growing else -1e-12))
+            # With several wells it matters where the motion itself passes the edge.
+            return "on", centre + (laps.leaving(first, kind) or beyond if len(laps.places) > 1 else beyond)
         radius = following
     return ("on", centre + radius) if growing else ("steady-slip", centre)
 
@@ -652,36 +666,46 @@ def slip_cycles(parameters: OscillatorParameters) -> list[LimitCycle]:
     return found
 
 
-@functools.lru_cache(maxsize=64)
-def limits_of_slip(parameters: OscillatorParameters) -> list[tuple[float, list[tuple[float, LimitCycle | None]]]]:
-    """Return what maxima of x right of each equilibrium that slip can turn about tend to, by that equilibrium: pairs of
-    a radius, ascending, and what maxima nearer than it, but no nearer than the last, tend to (None: they leave these
-    radii, or it is not known).
+class SlipLimit(NamedTuple):
+    """What maxima of x tend to that are nearer to an equilibrium than ``radius``, but not nearer than the last limit's.
+
+    Either ``cycle``, or they leave these radii, with a maximum between the two radii ``leaves``, or (both None) it is
+    not known.
     """
+
+    radius: float
+    cycle: LimitCycle | None = None
+    leaves: tuple[float, float] | None = None
+
+
+@functools.lru_cache(maxsize=64)
+def limits_of_slip(parameters: OscillatorParameters) -> list[tuple[float, list[SlipLimit]]]:
+    """Return the limits of maxima of x right of each equilibrium that slip can turn about, by ascending radius."""
     found = []
     for section in sections(parameters):
         centre = section.equilibrium.x
-        rows: list[tuple[float, LimitCycle | None]] = []
-        reached = 0.0
+        limits: list[SlipLimit] = []
         for part in section.ranges:
             low, high = part.ends
-            if low > reached:
-                rows.append((low, None))
-            orbits = [_pure_slip(parameters, centre + radius, centre + radius, 0.0) for radius in part.cycles]
-            inmost = (
-                _steady(parameters, "steady-slip", centre, centre, 0.0) if low == 0.0 and section.attracts else None
-            )
-            family = None
+            if low > 0.0:
+                limits.append(SlipLimit(low))
             if conserves_energy(parameters) and part.tendencies == (0,):
                 # A little inside: on the very edge, where the orbit touches the belt's speed, rounding decides.
                 place = centre + high - 1e-9 * (high - low)
-                family = _pure_slip(parameters, place, place, 0.0, "neutral")
-            for radius, tendency, inner, outer in zip(
-                (*part.cycles, high), part.tendencies, (inmost, *orbits), (*orbits, None), strict=True
+                limits.append(SlipLimit(high, _pure_slip(parameters, place, place, 0.0, "neutral")))
+                continue
+            orbits = [_pure_slip(parameters, centre + radius, centre + radius, 0.0) for radius in part.cycles]
+            steady = _steady(parameters, "steady-slip", centre, centre, 0.0)
+            # A range's first radius and its last are fixed points only where the first is the equilibrium.
+            inmost = SlipLimit(high, *((steady, None) if low == 0.0 else (None, (part.after[0], low))))
+            outmost = SlipLimit(high, None, (high, part.after[1]))
+            marks = [inmost, *(SlipLimit(high, orbit) for orbit in orbits), outmost]
+            for radius, tendency, (inner, outer) in zip(
+                (*part.cycles, high), part.tendencies, itertools.pairwise(marks), strict=True
             ):
-                rows.append((radius, (family, outer, inner)[tendency]))
-            reached = high
-        found.append((centre, rows))
+                limit = (SlipLimit(radius), outer, inner)[tendency]
+                limits.append(limit._replace(radius=radius))
+        found.append((centre, limits))
     return found
 
 
@@ -721,20 +745,18 @@ def attractors(parameters: OscillatorParameters) -> list[LimitCycle]:
         if not any(same_motion(cycle, other) for other in found):
             found.append(cycle)
 
-    for _, limits in limits_of_slip(parameters):
-        for _, cycle in limits:
-            if cycle is not None and cycle.kind == "neutral":
-                add(cycle)
+    of_slip = [limit.cycle for _, limits in limits_of_slip(parameters) for limit in limits if limit.cycle is not None]
+    for cycle in of_slip:
+        if cycle.kind == "neutral":
+            add(cycle)
     for _, right in stick_intervals(parameters):
         with contextlib.suppress(OrbitError):
             add(limit_of_motion(parameters, right, parameters.belt_speed))
     for section in sections(parameters):
         if section.attracts:
             add(_steady(parameters, "steady-slip", section.equilibrium.x, section.equilibrium.x, 0.0))
-    for _, limits in limits_of_slip(parameters):
-        for _, cycle in limits:
-            if cycle is not None:
-                add(cycle)
+    for cycle in of_slip:
+        add(cycle)
     return sorted(found, key=lambda cycle: cycle.x_max + cycle.x_min)
 
 

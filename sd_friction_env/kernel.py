@@ -30,11 +30,12 @@ STRIBECK, COULOMB, HYPERBOLIC, EXPONENTIAL = 0, 1, 2, 3
 
 # The mode is the sign of v_rel, frozen until an event.
 SLIP_BACKWARD, STICK, SLIP_FORWARD = -1, 0, 1
+UNKNOWN = 2  # what the mode was before
 
 OK, CONTACT_LOST, EVENT_LIMIT, STEP_LIMIT = 0, 1, 2, 3
 
-NO_EVENT, RESTICK, CROSSING, GRAZING, BREAKAWAY, CONTACT_LOSS, TURNING, LANDING, STUCK_STEP = 0, 1, 2, 3, 4, 5, 6, 7, 8
-SWITCHING = 9
+NO_EVENT, RESTICK, CROSSING, GRAZING, BREAKAWAY, CONTACT_LOSS, TURNING, LANDING = range(8)
+STEP_SIZE_UNDERFLOW, SWITCHING = 8, 9
 
 STATUS_NAMES = {OK: "ok", CONTACT_LOST: "contact lost", EVENT_LIMIT: "event limit", STEP_LIMIT: "step limit"}
 EVENT_NAMES = {
@@ -43,7 +44,7 @@ EVENT_NAMES = {
     GRAZING: "grazing",
     BREAKAWAY: "breakaway",
     CONTACT_LOSS: "contact-loss",
-    STUCK_STEP: "step-limit",
+    STEP_SIZE_UNDERFLOW: "step-limit",
     SWITCHING: "switching",
 }
 
@@ -53,6 +54,8 @@ FORCE, BELT_SPEED = 0, 1
 TOLERANCE = 1e-10
 MAX_SLIP_STEP = 0.2
 MIN_SLIP_STEP = 1e-16
+# A motion that needs more trial steps than these is given up (STEP_LIMIT): so many at once, so many per unit of time.
+SLIP_TRIALS, SLIP_TRIAL_RATE = 100000.0, 15000.0
 STIFF = 1e-4  # where friction is so steep that v changes by |a| h, no estimate gets below 1e-14 of that change
 MAX_EVENTS = 256  # in one call of advance
 NOTHING_KNOWN = (0.0,) * 18  # of a slip that begins
@@ -222,7 +225,8 @@ def _into_frame(laws, x, v, v_belt):
     way, speed, _, _ = _ripple(laws)
     v = v - speed
     # Where a state was left, its time was rounded otherwise, and so was the ripple's phase.
-    zero = V_REL_ZERO + PHASE_ROUNDING * laws.ripple * (laws.ripple_rate * laws.time + abs(laws.ripple_phase))
+    phase = laws.ripple_rate * laws.time + abs(laws.ripple_phase)
+    zero = V_REL_ZERO + PHASE_ROUNDING * (laws.ripple * phase + abs(v_belt))
     return x - way, v_belt if abs(v - v_belt) <= zero else v
 
 
@@ -672,7 +676,9 @@ def _slip_step(plant, mode, x, v, v_belt, dv_belt, u, h):
     # Hairer's blend of a fifth- and a third-order estimate; the tiny term only keeps 0/0 away.
     square5 = e5x * e5x + e5v * e5v
     square3 = e3x * e3x + e3v * e3v
-    error = h * square5 / math.sqrt(2.0 * (square5 + 0.01 * square3) + 1e-200)
+    blend = 2.0 * (square5 + 0.01 * square3) + 1e-200
+    # Where the stages overflow, a finite number over an infinite one would read as no error at all.
+    error = h * square5 / math.sqrt(blend) if blend < math.inf else math.inf
     return x_end, v_end, a1, a12, error, int_v2, int_fv
 
 
@@ -935,10 +941,10 @@ def _switching(plant, laws, mode, x, v, v_belt, a_belt, u, x_end, v_end, h):
     gap = side * room_x(plant, x)
     gap_end = side * room_x(end, x_end)
     rises = side * room_v(plant, v) > 0.0
-    leaves = gap_end < -SIDE_ZERO or (gap > SIDE_ZERO and gap_end <= 0.0)
+    turned = side * room_v(end, v_end) > 0.0
+    leaves = gap_end < -SIDE_ZERO or (gap > SIDE_ZERO and gap_end <= (0.0 if turned else SIDE_ZERO))
     low = 0.0
     high = h
-    turned = side * room_v(end, v_end) > 0.0
     if (rises and not turned and leaves and gap <= SIDE_ZERO) or (not rises and turned and not leaves):
         # From zero up and back, or down and up again: it turns in between, at the gap's extreme.
         first = 0.0
@@ -1019,16 +1025,17 @@ def _at_zero(laws, x):
 
 
 @compiled
-def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_turning, known):
+def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_turning, trials, known):
     """Slip for ``duration``, or until v_rel returns to zero (LANDING), contact is lost (CONTACT_LOSS), v changes
     sign (TURNING, if asked for), x does where that switches the field (SWITCHING) or the error rule cannot be met
-    (STUCK_STEP).
+    in the trial steps that are left: ``trials``, and SLIP_TRIAL_RATE more per unit of time (STEP_SIZE_UNDERFLOW).
 
     ``known`` are 18 numbers: whether the first step was tried already (0: no, 1: over ``duration``, 2: and the time at
     which it lands, or else turns, was guessed and looked at), what :func:`slip_step` gave, the time, and what
     :func:`_gap_at` gave there.
-    Return the time spent, x, v, the event, the integrals of v^2 and of the contact force's power, and the least and
-    greatest x met. After LANDING v equals the belt speed exactly, after TURNING it is exactly zero.
+    Return the time spent, x, v, the event, the integrals of v^2 and of the contact force's power, the least and
+    greatest x met, and the trial steps left. After LANDING v equals the belt speed exactly, after TURNING it is exactly
+    zero.
     """
     plant = _faced_in_slip(plant, plant.laws, mode, x, v, v_belt, u)
     longest = _short_of_excitation(plant.laws, 1.0, MAX_SLIP_STEP)
@@ -1040,11 +1047,13 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
     int_fv = 0.0
     event = NO_EVENT
     first = True
+    gap = 0.0
     while t < duration:
         remaining = duration - t
         h = min(h, remaining)
         belt = v_belt + a_belt * t
         now = later(plant, t)
+        trials -= 1.0
         looked = first and known[0] == 2.0
         if first and known[0] > 0.0:
             trial = known[1:8]
@@ -1056,8 +1065,8 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
         noise = h * _rounding(now, now.laws, mode, x, v, belt)
         if not error <= max(allowed, noise):  # "not" lets a NaN shrink the step too
             h = 0.5 * h
-            if h < MIN_SLIP_STEP:
-                event = STUCK_STEP
+            if h < MIN_SLIP_STEP or trials + SLIP_TRIAL_RATE * t < 0.0:
+                event = STEP_SIZE_UNDERFLOW
                 break
             continue
         length = h
@@ -1141,13 +1150,18 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
         int_fv += dfv
         if event != NO_EVENT:
             break
+        if trials + SLIP_TRIAL_RATE * t < 0.0:
+            event = STEP_SIZE_UNDERFLOW
+            break
         if error < max(STEP_DOUBLING * allowed, noise):
             h = min(2.0 * h, longest)
     if event == NO_EVENT:
         belt = v_belt + a_belt * duration
         if mode * (v - belt) <= V_REL_ZERO:
             v = belt
-    return t, x, v, event, int_v2, int_fv, x_min, x_max
+            if gap > V_REL_ZERO:  # an open gap has closed just now; what has not left the surface yet does not land
+                event = LANDING
+    return t, x, v, event, int_v2, int_fv, x_min, x_max, trials + SLIP_TRIAL_RATE * t
 
 
 @compiled
@@ -1159,9 +1173,11 @@ def slip_across(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_turning)
     x_min = room_x(plant, x)
     x_max = x_min
     event = SWITCHING
+    trials = SLIP_TRIALS
     for _ in range(MAX_EVENTS):
-        dt, x, v, event, dv2, dfv, low, high = slip_until_event(
-            later(plant, t), mode, x, v, v_belt + a_belt * t, a_belt, u, duration - t, stop_at_turning, NOTHING_KNOWN
+        now = later(plant, t)
+        dt, x, v, event, dv2, dfv, low, high, trials = slip_until_event(
+            now, mode, x, v, v_belt + a_belt * t, a_belt, u, duration - t, stop_at_turning, trials, NOTHING_KNOWN
         )
         t += dt
         int_v2 += dv2
@@ -1311,7 +1327,9 @@ def _switches_in_stick(plant, laws, x, v_belt, a_belt, t, t_end):
                 first = middle
             else:
                 high = middle
-    if side * room_x(later(plant, high), x + (v_belt + 0.5 * a_belt * high) * high) > -SIDE_ZERO:
+    end = later(plant, high)
+    leaving = side * room_v(end, v_belt + a_belt * high) < 0.0
+    if side * room_x(end, x + (v_belt + 0.5 * a_belt * high) * high) > (SIDE_ZERO if leaving else -SIDE_ZERO):
         return False, t_end
     for _ in range(200):
         middle = 0.5 * (low + high)
@@ -1445,12 +1463,13 @@ def advance(plant, x, v, v_belt, a_belt, u, duration, events):
     of events, the integral of v^2, the time stuck, the integral of the contact force's power, and the least and
     greatest x met.
     """
-    return _advance(plant, x, v, v_belt, a_belt, u, duration, events, NOTHING_KNOWN)
+    return _advance(plant, UNKNOWN, x, v, v_belt, a_belt, u, duration, events, NOTHING_KNOWN)
 
 
 @compiled
-def _advance(plant, x, v, v_belt, a_belt, u, duration, events, known):
-    """:func:`advance`, where ``known`` (see :func:`slip_until_event`) is of the slip it begins with, if it does."""
+def _advance(plant, mode, x, v, v_belt, a_belt, u, duration, events, known):
+    """:func:`advance` of a motion in this mode (UNKNOWN: that of the state), where ``known`` (see
+    :func:`slip_until_event`) is of the slip it begins with, if it does."""
     t = 0.0
     n_events = 0
     int_v2 = 0.0
@@ -1460,10 +1479,14 @@ def _advance(plant, x, v, v_belt, a_belt, u, duration, events, known):
     x_max = x
     belt = v_belt
     status = OK
+    trials = SLIP_TRIALS
     x_room = x
     v_room = v
     x, v = _into_frame(plant.laws, x, v, v_belt)
-    mode = _mode_of(plant, x, v, v_belt, a_belt, u)
+    if mode == UNKNOWN:
+        mode = _mode_of(plant, x, v, v_belt, a_belt, u)
+    elif mode == STICK:
+        v = v_belt
     if spring(plant, x_room)[1] <= 0.0:
         return x_room, v_room, v_belt, mode, CONTACT_LOST, 0.0, 0, 0.0, 0.0, 0.0, x_room, x_room
     while t < duration:
@@ -1473,15 +1496,15 @@ def _advance(plant, x, v, v_belt, a_belt, u, duration, events, known):
             dt, event, x, dv2, dfv, low, high = _stick_leg(now, x, belt, a_belt, u, remaining)
             stick_time += dt
         else:
-            dt, x, v, event, dv2, dfv, low, high = slip_until_event(
-                now, mode, x, v, belt, a_belt, u, remaining, False, known
+            dt, x, v, event, dv2, dfv, low, high, trials = slip_until_event(
+                now, mode, x, v, belt, a_belt, u, remaining, False, trials, known
             )
             known = NOTHING_KNOWN
         int_v2 += dv2
         int_fv += dfv
         x_min = min(x_min, low)
         x_max = max(x_max, high)
-        t = duration if event == NO_EVENT else t + dt
+        t = duration if event == NO_EVENT or dt >= remaining else t + dt
         belt = v_belt + a_belt * t
         then = later(plant, t)
         kind = event
@@ -1509,7 +1532,7 @@ def _advance(plant, x, v, v_belt, a_belt, u, duration, events, known):
             if event == CONTACT_LOSS:
                 status = CONTACT_LOST
                 break
-            if event == STUCK_STEP:
+            if event == STEP_SIZE_UNDERFLOW:
                 status = STEP_LIMIT
                 break
             if n_events >= MAX_EVENTS:
@@ -1522,9 +1545,10 @@ def _advance(plant, x, v, v_belt, a_belt, u, duration, events, known):
 
 
 @compiled
-def trace(plant, x, v, v_belt, a_belt, u, times, samples, events):
+def trace(plant, mode, x, v, v_belt, a_belt, u, times, samples, events):
     """Follow one held interval and keep samples: x, v, v_belt and mode at each of ``times`` (n,), counted from 0.
 
+    ``mode``: the mode so far, under the same drive; UNKNOWN where the drive has jumped.
     ``samples`` (n, 4) and ``events`` (m, 4) are filled; the sampling stops early while there is still room for
     another sample's events. Return the samples taken, the events kept, the status, the time reached, and the integrals
     of v^2, of the stick indicator and of the contact force's power.
@@ -1537,8 +1561,9 @@ def trace(plant, x, v, v_belt, a_belt, u, times, samples, events):
     status = OK
     t = 0.0
     while taken < len(times) and status == OK and len(events) - n_events >= MAX_EVENTS:
-        x, v, belt, mode, status, dt, n, dv2, dstick, dfv, _, _ = advance(
-            later(plant, t), x, v, v_belt + a_belt * t, a_belt, u, times[taken] - t, events[n_events:]
+        now = later(plant, t)
+        x, v, belt, mode, status, dt, n, dv2, dstick, dfv, _, _ = _advance(
+            now, mode, x, v, v_belt + a_belt * t, a_belt, u, times[taken] - t, events[n_events:], NOTHING_KNOWN
         )
         for i in range(n_events, n_events + n):
             events[i, 0] += t
@@ -1546,7 +1571,11 @@ def trace(plant, x, v, v_belt, a_belt, u, times, samples, events):
         int_v2 += dv2
         stick_time += dstick
         int_fv += dfv
+        with_belt = v == room_v(later(now, dt), belt)
         t = times[taken] if status == OK else t + dt
+        belt = v_belt + a_belt * t  # by one formula, however the motion is cut into pieces
+        if with_belt:
+            v = room_v(later(plant, t), belt)
         samples[taken, 0] = x
         samples[taken, 1] = v
         samples[taken, 2] = belt
@@ -1952,11 +1981,11 @@ def control_interval(
     a_limit, evenly over the interval. The reward terms (all <= 0) are averages over the interval.
     Return x, v, v_belt, mode, status, events, u, a_belt, the three reward terms (vibration, effort, stick), the
     means over the interval of v^2, of the stick indicator, of the contact force's and the control force's power, the
-    least and greatest x, and the normal force at the end.
+    least and greatest x, the normal force at the end, and the time reached (that of the interval, if status is OK).
     """
     plant = Plant(geometry, alpha, g1, beta, mu_s, k1, k3, laws)
     u, a_belt = _actuation(actuator, authority, a_limit, belt_speed, interval, v_belt, action)
-    x_end, v, v_belt, mode, status, _, n_events, int_v2, stick_time, int_fv, x_min, x_max = advance(
+    x_end, v, v_belt, mode, status, t, n_events, int_v2, stick_time, int_fv, x_min, x_max = advance(
         plant, x, v, v_belt, a_belt, u, interval, None
     )
     mean_v2, stick_fraction, friction_power, control_power, vibration, effort, stick = _weighed(
@@ -1980,7 +2009,8 @@ def control_interval(
         control_power,
         x_min,
         x_max,
-        spring(later(plant, interval), x_end)[1],
+        spring(later(plant, t), x_end)[1],
+        t,
     )
 
 
@@ -2109,7 +2139,8 @@ _X_END, _V_END, _BELT_END, _MODE, _EVENTS, _STATUS = 13, 14, 15, 16, 17, 18
 _INT_V2, _STICK_TIME, _INT_FV, _X_MIN, _X_MAX, _NORMAL = 19, 20, 21, 22, 23, 24
 _DONE_FAST = 25  # 1 where the fast path gave the answer
 _A, _A_END, _ERROR = 26, 27, 28
-_WORK_ROWS = 45
+_T_END = 45  # time reached, written where the status is not OK
+_WORK_ROWS = 46
 WORK_SIZE = 2 * _WORK_ROWS * STRIDE  # a block's, and one for those of its environments that must be brought together
 # Rows of the second one while the places of events are looked at.
 _L_TIME, _L_SIDE, _L_LEVEL, _L_RATE, _L_MODE, _L_LANE = 13, 14, 15, 16, 17, 18
@@ -2142,6 +2173,7 @@ _OPEN, _FINISHED, _LANDED = 0.0, 1.0, 2.0  # what _F_WAY says
     S_LATE_HIGH,
     S_LATE_STICK,
     S_LATE_TIME,
+    S_END_TIME,
     S_FRICTION,
     S_MU_K,
     S_DECAY,
@@ -2156,8 +2188,8 @@ _OPEN, _FINISHED, _LANDED = 0.0, 1.0, 2.0  # what _F_WAY says
     S_DEPTH,
     S_DEPTH_RATE,
     S_DEPTH_PHASE,
-) = range(35)
-STATE_ROWS = 35
+) = range(36)
+STATE_ROWS = 36
 # ... and whole numbers.
 I_GEOMETRY, I_STEPS, I_KEY, I_EPISODE, I_SEEN, I_OVER, I_FIRST_STEP, I_STATUS = 0, 1, 2, 3, 4, 5, 6, 7
 INTEGER_ROWS = 8
@@ -2605,8 +2637,9 @@ def _lane_by_events(geometry, w, i, interval, known):
 
 @compiled
 def _plant_by_events(plant, w, i, interval, known):
-    x, v, belt, mode, status, _, n_events, int_v2, stick_time, int_fv, x_min, x_max = _advance(
+    x, v, belt, mode, status, t, n_events, int_v2, stick_time, int_fv, x_min, x_max = _advance(
         plant,
+        UNKNOWN,
         w[_X * STRIDE + i],
         w[_V * STRIDE + i],
         w[_BELT * STRIDE + i],
@@ -2627,8 +2660,9 @@ def _plant_by_events(plant, w, i, interval, known):
     w[_INT_FV * STRIDE + i] = int_fv
     w[_X_MIN * STRIDE + i] = x_min
     w[_X_MAX * STRIDE + i] = x_max
-    w[_NORMAL * STRIDE + i] = spring(later(plant, interval), x)[1]
+    w[_NORMAL * STRIDE + i] = spring(later(plant, t), x)[1]
     w[_DONE_FAST * STRIDE + i] = 1.0
+    w[_T_END * STRIDE + i] = t
     return 0 if status == OK else 1
 
 
@@ -2657,6 +2691,14 @@ def _lane_after_trial(geometry, w, i, sub, n, interval, stage):
         sub[(_LOOK + 8) * STRIDE + n],
     )
     return _lane_by_events(geometry, w, i, interval, known)
+
+
+@in_lanes
+def _episode_time(state, integers, i, interval):
+    """Return the time in environment i's episode; it stops where the motion did."""
+    if integers[I_OVER, i] == ENDED:
+        return state[S_END_TIME, i]
+    return integers[I_STEPS, i] * interval
 
 
 @in_lanes
@@ -2712,7 +2754,7 @@ def observe(task, codes, state, integers, past, shown, observations, which):
             observations[i, place] = _observed(modulation, 1.0, task[T_BELT_AUTHORITY], limit)
             place += 1
         if codes[T_SEES_PHASES]:
-            time = integers[I_STEPS, i] * task[T_INTERVAL]
+            time = _episode_time(state, integers, i, task[T_INTERVAL])
             for row in (S_FORCE, S_RIPPLE, S_DEPTH):
                 angle = state[row + 1, i] * time + state[row + 2, i]
                 observations[i, place] = math.cos(angle)
@@ -2809,7 +2851,7 @@ def _shown_belt(laws, mode, v, v_belt):
 @compiled
 def arrays_in(memory):
     """Return the arrays that lie in the flat ``memory`` of one environment, as a batch of one has them: task (12,),
-    codes (9,), state (35, 1), integers (8, 1), past (delay + 1 or 0, 2, 1) and shown (1, p), in this order."""
+    codes (9,), state (36, 1), integers (8, 1), past (delay + 1 or 0, 2, 1) and shown (1, p), in this order."""
     codes = memory[TASK_NUMBERS : TASK_NUMBERS + TASK_CODES].view(np.int64)
     first = TASK_NUMBERS + TASK_CODES
     integers = memory[first : first + INTEGER_ROWS].view(np.int64).reshape((INTEGER_ROWS, 1))
@@ -2847,6 +2889,7 @@ def _step_alone(memory, observations, action, beyond):
         x_min,
         x_max,
         normal_force,
+        t,
     ) = control_interval(
         integers[I_GEOMETRY, 0],
         state[S_ALPHA, 0],
@@ -2871,7 +2914,7 @@ def _step_alone(memory, observations, action, beyond):
     state[S_X, 0] = x
     state[S_V, 0] = v
     state[S_BELT, 0] = v_belt
-    state[S_TRAVEL, 0] += 0.5 * (v_belt_before + v_belt) * interval
+    state[S_TRAVEL, 0] += 0.5 * (v_belt_before + v_belt) * t
     state[S_VIBRATION, 0] += vibration
     state[S_EFFORT, 0] += effort
     state[S_STICK, 0] += stick
@@ -2889,6 +2932,7 @@ def _step_alone(memory, observations, action, beyond):
     contact_loss = 0.0
     if status != OK:
         integers[I_OVER, 0] = ENDED
+        state[S_END_TIME, 0] = (steps - 1) * interval + t
         if status == CONTACT_LOST:
             terminated = True
             steps_left = max(0, codes[T_EPISODE_STEPS] - steps) + 1
@@ -2898,7 +2942,8 @@ def _step_alone(memory, observations, action, beyond):
         else:
             truncated = True
     observe(task, codes, state, integers, past, shown, observations, (0,))
-    v_belt_shown, v_rel = _shown_belt(laws_of(state, 0, steps * interval, beyond), mode, v, v_belt)
+    time = _episode_time(state, integers, 0, interval)
+    v_belt_shown, v_rel = _shown_belt(laws_of(state, 0, time, beyond), mode, v, v_belt)
     return (
         x,
         v,
@@ -2906,7 +2951,7 @@ def _step_alone(memory, observations, action, beyond):
         v_rel,
         mode,
         normal_force,
-        steps * interval,
+        time,
         force,
         a_belt,
         x_min,
@@ -3000,6 +3045,11 @@ def _account(task, codes, state, integers, work, wanted, rewards, over, report, 
     w = work[: _WORK_ROWS * STRIDE]
     q = work[_WORK_ROWS * STRIDE :]
     _weigh_lanes(w, q, m, interval, task[T_W_EFFORT], task[T_W_STICK])
+    if failures > 0:
+        for i in range(m):
+            if w[_STATUS * STRIDE + i] != OK:
+                belts = w[_BELT * STRIDE + i] + w[_BELT_END * STRIDE + i]
+                q[_Q_WAY * STRIDE + i] = 0.5 * belts * w[_T_END * STRIDE + i]
     for row in range(3):
         place = state[S_X + row, first : first + m]
         for i in range(m):
@@ -3054,6 +3104,9 @@ def _account(task, codes, state, integers, work, wanted, rewards, over, report, 
                 ended += 0 if truncated[i] else 1
                 integers[I_OVER, first + i] = ENDED
                 integers[I_STATUS, first + i] = status
+                time = (steps[i] - 1) * interval + w[_T_END * STRIDE + i]
+                state[S_END_TIME, first + i] = time
+                q[_Q_TIME * STRIDE + i] = time
                 if status != CONTACT_LOST:
                     truncated[i] = True
                     continue
@@ -3080,7 +3133,7 @@ def _account(task, codes, state, integers, work, wanted, rewards, over, report, 
 
 @compiled
 def _observe_block(task, codes, w, shown, observations, first, m):
-    """:func:`observe` for a block whose sensors neither wait nor err."""
+    """:func:`observe` for a block whose sensors neither wait nor err nor see phases."""
     limit = task[T_LIMIT]
     x_offset = task[T_X_OFFSET]
     x_scale = task[T_X_SCALE]
@@ -3173,7 +3226,7 @@ def _stepper(geometry):
     It takes
 
         work: (WORK_SIZE,), this call's own. start, end: which environments to step.
-        task (12,), codes (9,): what holds for the whole batch. state (35, n), integers (8, n): of each environment;
+        task (12,), codes (9,): what holds for the whole batch. state (36, n), integers (8, n): of each environment;
             rows as named above. past, shown: see :func:`observe`. With T_ONE_PLANT the plant and its belt speed stand
             in both halves of ``work`` already; the belt's way is only kept with T_TRAVEL.
         actions: (n,), finite; outside [-1, 1] they are clipped.
@@ -3211,7 +3264,7 @@ def _stepper(geometry):
         w = work[: _WORK_ROWS * STRIDE]
         sub = work[_WORK_ROWS * STRIDE :]
         one_plant = codes[T_ONE_PLANT] == 1
-        plain = task[T_SENSOR_NOISE] == 0.0 and codes[T_SENSOR_DELAY] == 0
+        plain = task[T_SENSOR_NOISE] == 0.0 and codes[T_SENSOR_DELAY] == 0 and codes[T_SEES_PHASES] == 0
         ended = 0
         for first in range(start, end, LANES):
             m = min(LANES, end - first)
@@ -3352,7 +3405,7 @@ def step_beyond(
             if wanted[row] == O_BELT or wanted[row] == O_V_REL:
                 for i in range(m):
                     j = first + i
-                    laws = laws_of(state, j, integers[I_STEPS, j] * interval, beyond)
+                    laws = laws_of(state, j, _episode_time(state, integers, j, interval), beyond)
                     belt, v_rel = _shown_belt(laws, w[_MODE * STRIDE + i], state[S_V, j], state[S_BELT, j])
                     report[row, j] = belt if wanted[row] == O_BELT else v_rel
         observe(task, codes, state, integers, past, shown, observations, range(first, first + m))

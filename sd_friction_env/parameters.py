@@ -106,7 +106,7 @@ class OscillatorParameters:
         g1: weight, g/(L omega0^2), in [0.001, 100].
         beta: damping ratio, C/(2 M omega0), in [0, 10].
         mu_s: static friction coefficient, in [0, 10].
-        mu_m: least kinetic friction coefficient, in [0, mu_s].
+        mu_m: least kinetic friction coefficient, in [0, 10]; of "stribeck", in [0, mu_s].
         v_m: relative speed at which friction is least, in [0.01, 100].
         belt_speed: the belt's (mean) speed v_b, in [0, 10].
         time_scale: seconds per unit of time, 1/omega0 (1 unless made by :meth:`from_physical`).
@@ -163,11 +163,12 @@ class OscillatorParameters:
         checked_choice("friction", self.friction, FRICTIONS)
         for name, (low, high) in RANGES.items():
             object.__setattr__(self, name, checked_number(name, getattr(self, name), low, high))
-        if self.mu_m > self.mu_s:
+        if self.mu_m > self.mu_s and self.friction == "stribeck":
             raise ValueError(f"mu_m must not exceed mu_s = {self.mu_s!r}, got {self.mu_m!r}")
         if self.mu_k > self.mu_s and self.friction in ("coulomb", "exponential"):
             raise ValueError(f"mu_k must not exceed mu_s = {self.mu_s!r}, got {self.mu_k!r}")
-        if self.alpha < SMALLEST_ALPHA and (self.alpha != 0.0 or self.geometry == "cubic"):
+        smallest = {"exact": 0.0, "cubic": SMALLEST_ALPHA}.get(self.geometry, self.alpha)
+        if self.alpha < SMALLEST_ALPHA and self.alpha != smallest:
             zero = "" if self.geometry == "cubic" else "0 or "
             raise ValueError(f"alpha must be {zero}a finite number in [{SMALLEST_ALPHA:g}, 10], got {self.alpha!r}")
 

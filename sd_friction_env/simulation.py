@@ -162,10 +162,14 @@ def simulate(
     damping = contact = control = excitation = stick_time = 0.0
     status = kernel.OK
     segment, begin = 0, 0.0
+    mode, u, a_belt = kernel.UNKNOWN, 0.0, 0.0
     while begin < t_end and status == kernel.OK:
         end = t_end if segment + 1 >= segments else min(t_end, (segment + 1) * hold)
+        before = u, a_belt
         u = float(forces[min(segment, forces.size - 1)])
         a_belt = float(accelerations[min(segment, accelerations.size - 1)])
+        if (u, a_belt) != before:
+            mode = kernel.UNKNOWN  # the drive has jumped
         inside = grid[(np.searchsorted(grid, begin, "right")) : np.searchsorted(grid, end, "right")]
         times = inside - begin
         extra = not inside.size or inside[-1] < end
@@ -179,7 +183,7 @@ def simulate(
             buffer = np.empty((max(4 * kernel.MAX_EVENTS, piece.size), 4))
             now = kernel.later(plant, t0)
             taken, n_events, status, reached, int_v2, stuck, int_fv = kernel.trace(
-                now, x, v, belt0, a_belt, u, piece, samples, buffer
+                now, mode, x, v, belt0, a_belt, u, piece, samples, buffer
             )
             if parameters.excited:
                 excitation += kernel.excitation_work(now, x, v, belt0, a_belt, u, reached, buffer[:n_events])
@@ -187,7 +191,8 @@ def simulate(
             damping -= 2.0 * parameters.beta * int_v2
             contact += int_fv
             stick_time += stuck
-            x, v, belt0, _ = samples[taken - 1].tolist()
+            x, v, belt0, last_mode = samples[taken - 1].tolist()
+            mode = int(last_mode)
             stamps = t0 + piece[:taken]
             if status != kernel.OK:
                 stamps[-1] = t0 + reached

@@ -49,7 +49,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "observation_limit": (1e-3, 1e6),
 }
 _COUNTS: dict[str, tuple[int, int]] = {"episode_steps": (1, 10**9), "sensor_delay": (0, 1000)}
-_SCALES: dict[str, tuple[float, float]] = {"x_offset": (-1e3, 1e3), "x_scale": (1e-6, 1e3), "v_scale": (1e-6, 1e3)}
+_SCALES: dict[str, tuple[float, float]] = {"x_offset": (-1e12, 1e12), "x_scale": (1e-9, 1e12), "v_scale": (1e-9, 1e12)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.env_checker import data_equivalence as same
 
-from sd_friction_env import ENVIRONMENT_IDS, OscillatorParameters, SDFrictionEnv, limit_cycle
+from sd_friction_env import ENVIRONMENT_IDS, OscillatorParameters, SDFrictionEnv, equilibria, limit_cycle
 from sd_friction_env.env import EnvState
 
 NOMINAL = OscillatorParameters()
@@ -194,6 +194,91 @@ def test_losing_contact_terminates_and_costs_more_than_any_way_to_go_on():
     assert info["reward_contact_loss"] <= -(100 - steps) * worst
     with pytest.raises(gym.error.ResetNeeded):
         env.step(np.zeros(1, np.float32))
+
+
+LOSING = {
+    "at rest": {"geometry": "cubic", "alpha": 0.2},
+    "under a ripple": {
+        "geometry": "cubic",
+        "friction": "hyperbolic",
+        "alpha": 0.85,
+        "mu_s": 0.8,
+        "delta": 1.7,
+        "g1": 0.6,
+        "ripple_amplitude": 0.55,
+        "ripple_frequency": 5.2,
+    },
+    "by the stiffness": {
+        "geometry": "cubic",
+        "alpha": 0.5,
+        "g1": 0.6,
+        "stiffness_amplitude": 0.9,
+        "stiffness_frequency": 3.0,
+        "ripple_amplitude": 0.1,
+        "ripple_frequency": 2.0,
+        "ripple_phase": 1.0,
+    },
+}
+
+
+@pytest.mark.parametrize("case", LOSING)
+@pytest.mark.parametrize("actuator", ["force", "belt_speed"])
+def test_the_last_info_and_observation_are_of_the_moment_at_which_contact_is_lost(case, actuator):
+    arguments = {"parameters": LOSING[case], "actuator": actuator, "control_interval": 0.32, "start": "random"}
+    arguments |= {"show_phases": True}
+    env = make(**arguments)
+    rng, lost = np.random.default_rng(0), 0
+    for seed in range(24):
+        observation, info = env.reset(seed=seed)
+        if info["normal_force"] <= 0.0:
+            continue  # a random start may lie where there is no contact
+        steps, terminated, truncated = 0, False, False
+        while not (terminated or truncated):
+            observation, _, terminated, truncated, info = env.step(rng.uniform(-1, 1, 1).astype(np.float32))
+            steps += 1
+        if not terminated:
+            continue
+        lost += 1
+        time, p = info["time"], env.unwrapped.parameters
+        assert (steps - 1) * 0.32 < time < steps * 0.32
+        belt = env.unwrapped.get_state().v_belt + p.ripple_amplitude * math.cos(
+            p.ripple_frequency * time + p.ripple_phase
+        )
+        assert info["v_belt"] == pytest.approx(belt, abs=1e-12)
+        assert info["v_rel"] == pytest.approx(info["v"] - belt, abs=1e-12)
+        assert info["normal_force"] == pytest.approx(0.0, abs=1e-9)
+        assert observation[-4:-2] == pytest.approx(
+            [
+                math.cos(p.ripple_frequency * time + p.ripple_phase),
+                math.sin(p.ripple_frequency * time + p.ripple_phase),
+            ],
+            abs=1e-6,
+        )
+    assert lost > 0
+
+
+@pytest.mark.parametrize("case", LOSING)
+def test_a_batch_tells_of_a_lost_contact_what_the_single_environment_tells(case):
+    arguments = {"parameters": LOSING[case], "control_interval": 0.32, "start": "random", "show_phases": True}
+    arguments["actuator"] = "belt_speed"
+    envs = [make(**arguments) for _ in range(24)]
+    batch = gym.make_vec("SDFriction/Force-v0", 24, info_keys="all", **arguments)
+    batch.reset(seed=0)
+    for i, env in enumerate(envs):
+        env.reset(seed=i)
+    rng, running, lost = np.random.default_rng(0), set(range(24)), 0
+    for _ in range(40):
+        actions = rng.uniform(-1, 1, (24, 1)).astype(np.float32)
+        observations, _, _, _, infos = batch.step(actions)
+        for i in sorted(running):
+            observation, _, terminated, truncated, info = envs[i].step(actions[i])
+            assert observation.tobytes() == observations[i].tobytes()
+            for name in ("time", "v_belt", "v_rel", "normal_force", "x", "mode"):
+                assert info[name] == infos[name][i], name
+            if terminated or truncated:
+                running.discard(i)
+                lost += terminated
+    assert lost > 0
 
 
 def test_a_custom_reward_sees_the_reported_terms():
@@ -441,3 +526,32 @@ def test_importing_the_package_loads_nothing_heavy():
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        {"geometry": "linear", "g1": 8.68, "beta": 1.3, "mu_s": 1.54, "mu_m": 0.42, "v_m": 0.0124, "belt_speed": 4.69},
+        {
+            "geometry": "linear",
+            "g1": 24.5,
+            "beta": 0.43,
+            "mu_s": 0.27,
+            "mu_m": 0.024,
+            "v_m": 0.0134,
+            "belt_speed": 0.0982,
+        },
+        {"friction": "exponential", "g1": 100.0, "mu_v": 10.0, "belt_speed": 10.0},
+    ],
+)
+def test_a_legal_plant_whose_equilibrium_is_far_away_makes_an_environment(plant):
+    env = make(parameters=plant)
+    place = equilibria(env.unwrapped.nominal)[-1].x
+    assert abs(place) > 1000.0
+    assert env.unwrapped.task.x_offset == place
+    observation, _ = env.reset(seed=0)
+    assert abs(observation[0]) < 1.0
+    _, reward, _, _, info = env.step(np.zeros(1, np.float32))
+    assert info["status"] == "ok"
+    assert math.isfinite(reward)
+    assert info["x"] == pytest.approx(place, rel=1e-3)

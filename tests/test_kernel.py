@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from sd_friction_env import kernel
 from sd_friction_env.parameters import FRICTIONS, GEOMETRIES, RANGES, SMALLEST_ALPHA, STATE_LIMIT, OscillatorParameters
@@ -214,10 +215,67 @@ for i, geometry in enumerate(("exact", "cubic", "linear")):
         x, v, belt = r[:3]
         out += struct.pack("<7d", *r[:3], *r[7:10], r[11])
     r = kernel.control_interval(*p.plant, 1, 0.5, 0.5, 0.2, 0.1, 0.1, 0.5, 0.4, 0.1, 0.21, -0.3)
-    out += struct.pack("<18d", *map(float, r))
+    out += struct.pack("<19d", *map(float, r))
     out += struct.pack("<d", kernel.random_normal(1, 2, 3, 4))
 sys.stdout.write(out.hex())
 """
+
+
+STIFF = {
+    "by v_m = .05": ({"v_m": 0.05, "mu_s": 0.5}, (0.734, -0.158)),
+    "by v_m = .02": ({"v_m": 0.02, "mu_s": 1.0}, (0.899, -0.417)),
+    "by a fast belt, linear": (
+        {"geometry": "linear", "g1": 0.33, "beta": 0.42, "mu_s": 0.41, "mu_m": 0.02, "v_m": 0.096, "belt_speed": 7.8},
+        (1.52, -0.39),
+    ),
+    "by a fast belt, exact": (
+        {"alpha": 3.28, "g1": 13.8, "beta": 4.7, "mu_s": 1.472, "mu_m": 1.424, "v_m": 0.0975, "belt_speed": 9.44},
+        (0.25955, 1.4087),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", STIFF)
+def test_a_step_whose_stages_overflow_is_refused_and_not_taken_for_exact(case):
+    # Radau's implicit formula has no such stages; friction slope and spring by hand.
+    values, (x, v) = STIFF[case]
+    p = OscillatorParameters(**values)
+
+    def slip(_, state):
+        w = state[1] - p.belt_speed
+        stretch = 1.0 - 1.0 / math.hypot(state[0], p.alpha)
+        linear = p.geometry == "linear"
+        restoring, normal = (state[0], p.g1) if linear else (state[0] * stretch, p.g1 - p.alpha * stretch)
+        return state[1], -2.0 * p.beta * state[1] - restoring - normal * (-p.mu_s - p.k1 * w + p.k3 * w**3)
+
+    known = solve_ivp(slip, (0.0, 0.1), (x, v), method="Radau", rtol=1e-10, atol=1e-13).y[:, -1]
+    assert known[1] < p.belt_speed  # it slips all the way
+    end = kernel.advance(p.plant, x, v, p.belt_speed, 0.0, 0.0, 0.1, None)
+    assert end[4] == kernel.OK
+    assert end[:2] == pytest.approx(known, abs=1e-7)
+
+
+def test_an_error_estimate_that_overflows_is_infinite():
+    plant = OscillatorParameters(v_m=0.05, mu_s=0.5).plant
+    for h in np.geomspace(1e-3, 0.2, 400):
+        x, v, _, _, error, _, _ = kernel.slip_step(plant, -1, 0.734, -0.158, 0.2, 0.0, 0.0, h)
+        assert error > kernel.TOLERANCE * h or (abs(x) < 1.0 and abs(v) < 0.2)
+
+
+def test_a_motion_too_stiff_for_the_error_rule_is_given_up_within_a_bounded_number_of_steps():
+    # Friction drags the mass along with a belt of acceleration 1e6, and rises 1e6 times as fast as v there.
+    plant = OscillatorParameters(v_m=0.01).plant
+    start = (plant, -1, 0.0, 0.1, 0.2, 1e6, 0.0, 1.0, False)
+    t, *_, event, _, _, _, _, left = kernel.slip_until_event(*start, 500.0, kernel.NOTHING_KNOWN)
+    assert event == kernel.STEP_SIZE_UNDERFLOW
+    assert -1.0 <= left < 0.0
+    assert 0.0 < t < 0.1
+    end = kernel.advance(plant, 0.0, 0.1, 0.2, 1e6, 0.0, 1.0, None)
+    assert end[4] == kernel.STEP_LIMIT
+    assert t < end[5] < 1.0
+    t, *_, event, _, _, _, _, left = kernel.slip_until_event(*start[:5], 0.0, *start[6:], 500.0, kernel.NOTHING_KNOWN)
+    assert event != kernel.STEP_SIZE_UNDERFLOW
+    assert left > 0.0
 
 
 # Environments by themselves and in a batch: many of them slip, stick, meet events, lose contact and begin anew.

@@ -99,3 +99,22 @@ def test_a_rig_in_si_units_becomes_dimensionless_and_leads_back():
 def test_a_rig_without_mass_stiffness_length_gravity_or_v_m_is_refused(name):
     with pytest.raises(ValueError, match=f"{name} must be"):
         OscillatorParameters.from_physical(**{**RIG, name: 0.0})
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"friction": "coulomb", "mu_s": 0.02, "mu_k": 0.02},  # below the default mu_m
+        {"friction": "hyperbolic", "mu_s": 0.02},
+        {"friction": "stribeck", "mu_s": 0.05, "mu_m": 0.02},  # below the default mu_k
+        {"geometry": "linear", "alpha": 5e-4},
+        {"geometry": "duffing", "alpha": 5e-4},
+    ],
+)
+def test_a_value_that_the_laws_do_not_use_is_not_checked_against_theirs(values):
+    parameters = OscillatorParameters(**values)
+    assert math.isfinite(parameters.restoring_force(0.5) + parameters.friction_coefficient(-0.1))
+    with pytest.raises(ValueError, match="mu_m must not exceed mu_s"):
+        OscillatorParameters(mu_s=0.02)
+    with pytest.raises(ValueError, match="mu_k must not exceed mu_s"):
+        OscillatorParameters(friction="exponential", mu_s=0.02)

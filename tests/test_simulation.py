@@ -99,3 +99,68 @@ def test_bad_arguments_are_refused_with_their_name(arguments, message):
         simulate(NOMINAL, **arguments)
     with pytest.raises(TypeError, match="force must be"):
         simulate(NOMINAL, force="strong")
+
+
+def kinds_of(history):
+    return [event.kind for event in history.events]
+
+
+@pytest.mark.parametrize(
+    ("plant", "start", "belt_acceleration", "events"),
+    [
+        (NOMINAL, (0.0, 0.2), -0.02, 0),
+        (NOMINAL.replace(friction="coulomb", mu_s=0.5, mu_k=0.3), (0.0, 0.2), 0.03, 1),
+        (NOMINAL.replace(geometry="linear", mu_s=0.5), (-0.3, 0.2), -0.1, 1),
+        (NOMINAL.replace(mu_s=1.0, ripple_amplitude=0.1, ripple_frequency=2.0), (0.0, 0.3), 0.05, 1),
+        (NOMINAL.replace(geometry="linear", mu_s=10.0, mu_m=9.0, g1=100.0), (0.0, 0.2), 70.0, 0),  # the belt gets fast
+    ],
+)
+def test_sampling_a_mass_that_rides_an_accelerating_belt_makes_no_events(plant, start, belt_acceleration, events):
+    x, v = start
+    once = simulate(plant, x=x, v=v, t_end=5.0, dt=100.0, belt_acceleration=belt_acceleration)
+    assert len(once.events) == events
+    for dt in (0.1, 0.01, 0.001):  # the last in more than one chunk
+        history = simulate(plant, x=x, v=v, t_end=5.0, dt=dt, belt_acceleration=belt_acceleration)
+        assert kinds_of(history) == kinds_of(once)
+        assert history.v[-1] == pytest.approx(once.v[-1], rel=1e-12)
+        stuck = history.mode == 0
+        assert np.all(abs(history.v[stuck] - history.v_belt[stuck]) <= 1e-14)
+
+
+def around(time, bits):
+    """Times up to so many bits before and after one."""
+    times = [time]
+    for direction in (0.0, np.inf):
+        near = time
+        for _ in range(bits):
+            near = float(np.nextafter(near, direction))
+            times.append(near)
+    return times
+
+
+@pytest.mark.parametrize(
+    ("plant", "start", "kind"),
+    [
+        (NOMINAL, (0.6, 0.2), "restick"),
+        (NOMINAL, (0.6, 0.2), "breakaway"),
+        (NOMINAL.replace(belt_speed=0.05, mu_s=0.05, mu_m=0.01), (1.3, -0.3), "crossing"),
+        (NOMINAL.replace(alpha=0.0, mu_s=0.3), (0.5, -2.0), "switching"),
+        (NOMINAL.replace(alpha=0.0, mu_s=2.0, mu_m=1.0), (-0.05, 0.2), "switching"),  # a stuck mass crosses x = 0
+        (NOMINAL.replace(geometry="cubic", alpha=0.2), (0.1, 3.0), "contact-loss"),
+        (NOMINAL.replace(friction="coulomb", force_amplitude=0.3, force_frequency=1.3), (0.6, 0.2), "restick"),
+        (NOMINAL.replace(ripple_amplitude=0.05, ripple_frequency=2.0), (0.6, 0.25), "restick"),
+        (NOMINAL.replace(ripple_amplitude=0.05, ripple_frequency=2.0), (0.6, 0.25), "breakaway"),
+    ],
+)
+def test_a_sample_or_a_hold_that_ends_at_an_event_neither_hides_nor_repeats_it(plant, start, kind):
+    x, v = start
+    once = simulate(plant, x=x, v=v, t_end=15.0, dt=100.0)
+    time = next(event.time for event in once.events if event.kind == kind)
+    for near in around(time, 30):
+        cuts = (
+            simulate(plant, x=x, v=v, t_end=15.0, dt=near),
+            simulate(plant, x=x, v=v, t_end=15.0, dt=100.0, force=np.zeros(int(15.0 / near) + 2), hold=near),
+        )
+        for history in cuts:
+            assert kinds_of(history) == kinds_of(once)
+            assert [e.time for e in history.events] == pytest.approx([e.time for e in once.events], abs=1e-9)

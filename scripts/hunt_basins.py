@@ -92,7 +92,9 @@ def follow(p: OscillatorParameters, x: float, v: float, found: Basins, label: in
         while left > 0.0:
             rate = stiffest(p, x, v)
             piece = min(left, 2e4 / rate)
-            x, v, _, mode, status, t, _, _, stick_time, _, x_min, x_max = kernel.advance(plant, x, v, belt, 0.0, 0.0, piece, None)
+            x, v, _, mode, status, t, _, _, stick_time, _, x_min, x_max = kernel.advance(
+                plant, x, v, belt, 0.0, 0.0, piece, None
+            )
             low, high = min(low, x_min), max(high, x_max)
             left = 0.0 if piece == left and status == kernel.OK else left - t
             spent += rate * (t - stick_time) / 3.0 + 200.0
@@ -107,13 +109,17 @@ def follow(p: OscillatorParameters, x: float, v: float, found: Basins, label: in
         last = (low, high)
         distances = [max(abs(low - a.x_min), abs(high - a.x_max)) / size for a in found.attractors]
         order = sorted(range(len(distances)), key=distances.__getitem__)
-        close = order[0] if order and distances[order[0]] < SAME and found.attractors[order[0]].kind != "neutral" else None
+        close = (
+            order[0] if order and distances[order[0]] < SAME and found.attractors[order[0]].kind != "neutral" else None
+        )
         if close is not None and close == near:
             return Verdict("held" if close == label else "wrong", f"reaches {close}")
         near = close
         if spent > BUDGET or (change < STILL and close is None):
             here = f"{low:.9g} to {high:.9g} after {duration:.3g}, changed by {change:.2g}"
-            if change < 100.0 * SAME * 1e-3 and (not order or distances[order[0]] > CHANGED or found.attractors[order[0]].kind == "neutral"):
+            if change < 100.0 * SAME * 1e-3 and (
+                not order or distances[order[0]] > CHANGED or found.attractors[order[0]].kind == "neutral"
+            ):
                 neutral = label >= 0 and found.attractors[label].kind == "neutral"
                 if neutral:
                     a = found.attractors[label]
@@ -141,8 +147,18 @@ def check_basins(seed: int, starts: int) -> tuple[int, int, list[dict[str, Any]]
             what = "undecided" if label == UNDECIDED else verdict.what
             held += what == "held"
             if what != "held":
-                rest.append({"seed": (seed, plant_number), "verdict": what, "why": verdict.why, "p": p, "x": x, "v": v, "label": label,
-                             "attractors": [(a.kind, a.x_min, a.x_max) for a in found.attractors]})
+                rest.append(
+                    {
+                        "seed": (seed, plant_number),
+                        "verdict": what,
+                        "why": verdict.why,
+                        "p": p,
+                        "x": x,
+                        "v": v,
+                        "label": label,
+                        "attractors": [(a.kind, a.x_min, a.x_max) for a in found.attractors],
+                    }
+                )
     return starts, held, rest
 
 

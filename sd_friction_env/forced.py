@@ -333,13 +333,24 @@ def forced_orbit(
 
 
 def _lap(
-    parameters: OscillatorParameters, state: tuple[float, float], multiple: int, period: float, phase: float
+    parameters: OscillatorParameters,
+    state: tuple[float, float],
+    multiple: int,
+    period: float,
+    phase: float,
+    in_sections: bool = True,
 ) -> tuple[Any, FloatArray]:
     """Return what the kernel's walk does over ``multiple`` cycles, and the tangent map (2, 2)."""
     vectors = np.eye(2)
     events = np.empty((kernel.MAX_EVENTS, 4))
     end = kernel.walk(
-        _plant(parameters, phase * period), *state, parameters.belt_speed, multiple * period, events, vectors
+        _plant(parameters, phase * period),
+        *state,
+        parameters.belt_speed,
+        multiple * period,
+        events,
+        vectors,
+        in_sections,
     )
     return end, vectors.T
 
@@ -350,7 +361,8 @@ def _closed(
     """Return the orbit of this multiple that Newton's method finds from a state, or None."""
     start = np.array(state)
     for _ in range(_NEWTON_STEPS):
-        end, tangent = _lap(parameters, (float(start[0]), float(start[1])), multiple, period, phase)
+        place = float(start[0]), float(start[1])
+        end, tangent = _lap(parameters, place, multiple, period, phase, in_sections=False)
         if end[3] != kernel.OK:
             return None
         error = np.array(end[:2]) - start
@@ -365,7 +377,7 @@ def _closed(
             return None
     else:
         return None
-    place = float(start[0]), float(start[1])
+    end, tangent = _lap(parameters, place, multiple, period, phase)
     rows, _, _ = _followed(parameters, place, period, phase, 0, multiple, growing=False)
     points = np.concatenate((start[None, :], rows[:-1, :2]))
     for divisor in range(1, multiple):

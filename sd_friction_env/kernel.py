@@ -1633,39 +1633,48 @@ SLIP_PATIENCE = 2000.0
 CREEP_PIECE = 30.0  # of slip, after which it is seen whether it creeps into a node
 STEPS_OF_A_PIECE, MOST_PIECES = 3e4, 400
 SETTLING_LAPS, SETTLING_EXITS = 8, 64  # before a passive motion that still slips is looked at more closely
-MOST_TURNINGS = 20_000  # of one start, in `classify`
-TRAPS_CHECKED = 600  # distances from a node at which its trap is seen to hold
+MOST_TURNINGS = 2000  # of one start, in `classify`
+TRAP_POINTS, TRAP_REFINEMENTS = 600, 5  # distances from a node at which its trap is seen to hold, and finer ones
 
 # A row of `traps` says which states certainly tend to a stable equilibrium.
 (TRAP_X, TRAP_BALL, TRAP_SLOPE, TRAP_LEFT, TRAP_RIGHT), TRAP_ROW = range(5), 5
 
 
 @compiled
-def trap_extents(plant, v_belt, centre, slope, nearest, farthest):
-    """Return how far to the left and to the right of a node the lines v = -slope (x - centre) hem slip in.
+def _hems_in(plant, v_belt, centre, slope, side, s):
+    """Whether, at a distance s to one side of a node, the line v = -slope (x - centre) hems in slip that nears it."""
+    x = centre + side * s
+    v = -side * slope * s
+    if spring(plant, x)[1] <= 0.0 or side * slip_forces(plant, SLIP_BACKWARD, x, 0.0, v_belt, 0.0)[0] >= 0.0:
+        return False
+    if v >= v_belt:
+        return slip_forces(plant, SLIP_BACKWARD, x, v_belt, v_belt, 0.0)[0] <= 0.0
+    return slope * slope * s - side * slip_forces(plant, SLIP_BACKWARD, x, v, v_belt, 0.0)[0] <= 0.0
 
-    Below the line a mass that nears the node cannot pass it: there the flow crosses the line towards the node, and
-    crosses v = 0 towards the line. Where the line is above the belt's speed, the mass must not land on the belt either.
+
+@compiled
+def trap_extent(plant, v_belt, centre, slope, side, nearest, farthest):
+    """Return how far to one side of a node the line v = -slope (x - centre) hems slip in.
+
+    Below the line a mass that nears the node cannot pass it: there the flow crosses the line towards v = 0, and v = 0
+    towards the line. Where the line is above the belt's speed, the mass must not land on the belt either.
     """
-    extents = (0.0, 0.0)
-    for side in (-1.0, 1.0):
-        extent = 0.0
-        for i in range(TRAPS_CHECKED):
-            s = nearest * math.exp(i / (TRAPS_CHECKED - 1.0) * math.log(farthest / nearest))
-            x = centre + side * s
-            v = -side * slope * s
-            held, _ = slip_forces(plant, SLIP_BACKWARD, x, 0.0, v_belt, 0.0)
-            if spring(plant, x)[1] <= 0.0 or side * held >= 0.0:
+    low = 0.0
+    high = nearest
+    ratio = math.exp(math.log(farthest / nearest) / TRAP_POINTS)
+    while high <= farthest and _hems_in(plant, v_belt, centre, slope, side, high):
+        low = high
+        high = high * ratio
+    if low == 0.0 or high > farthest:
+        return low
+    for _ in range(TRAP_REFINEMENTS):
+        step = (high - low) / 32.0
+        for _ in range(31):
+            if not _hems_in(plant, v_belt, centre, slope, side, low + step):
                 break
-            if v < v_belt:
-                a, _ = slip_forces(plant, SLIP_BACKWARD, x, v, v_belt, 0.0)
-                if not -side * a + slope * slope * s <= 0.0:
-                    break
-            elif not slip_forces(plant, SLIP_BACKWARD, x, v_belt, v_belt, 0.0)[0] <= 0.0:
-                break
-            extent = s
-        extents = (extent, extents[1]) if side < 0.0 else (extents[0], extent)
-    return extents
+            low = low + step
+        high = low + step
+    return low
 
 
 @compiled
@@ -3765,11 +3774,12 @@ def _pass_event(plant, mode, after, kind, x, v, v_belt, vectors):
 
 
 @compiled
-def walk(plant, x, v, v_belt, duration, events, vectors):
+def walk(plant, x, v, v_belt, duration, events, vectors, in_sections=True):
     """Follow a motion under excitation alone and carry tangents (n, 2) along it, if there are any.
 
-    An event on the section at either end, or due just after it, belongs to the motion that ends there: its saltation is
-    applied at the end, and not once more at the beginning of the motion that goes on from it.
+    ``in_sections``: an event on the section at either end, or due just after it, belongs to the motion that ends there:
+    its saltation is applied at the end, and not once more at the beginning of the motion that goes on from it. Without
+    it the tangents are the derivative of the end by the start.
     ``events`` (MAX_EVENTS, 4) is scratch space. Return x, v, the mode, the status, the time reached, the time stuck,
     the sticks and the forward-slip arcs that began, the least and greatest x, whether it ever stuck (the tangents then
     have one direction left) and the number of events without a derivative.
@@ -3785,7 +3795,9 @@ def walk(plant, x, v, v_belt, duration, events, vectors):
     x_leg, v_leg = _into_frame(plant.laws, x, v, v_belt)
     mode = _mode_of(plant, x_leg, v_leg, v_belt, 0.0, 0.0)
     side = _side_of(plant, x_leg, v_leg)
-    due = _event_due(plant, mode, 1.0 if room_x(plant, x_leg) > 0.0 else -1.0, x_leg, v_leg, v_belt)
+    due = NO_EVENT
+    if in_sections:
+        due = _event_due(plant, mode, 1.0 if room_x(plant, x_leg) > 0.0 else -1.0, x_leg, v_leg, v_belt)
     status = EVENT_LIMIT
     for _ in range(MOST_CALLS):
         now = later(plant, t)
@@ -3799,7 +3811,7 @@ def walk(plant, x, v, v_belt, duration, events, vectors):
             end = events[n, 0] if n < n_events else dt
             if mode == STICK:
                 ever_stuck = True
-                for i in range(len(vectors)):
+                for i in range(len(vectors) if due != BREAKAWAY else 0):
                     vectors[i, 1] = 0.0
             elif len(vectors) > 0:
                 _carry_in_slip(later(now, begin), mode, x_leg, v_leg, v_belt, end - begin, vectors)
@@ -3820,11 +3832,12 @@ def walk(plant, x, v, v_belt, duration, events, vectors):
                 side = 1.0 if room_v(then, v_leg) > 0.0 else -1.0
             mode = after
             begin = end
-        if status == OK:
+        if status == OK and in_sections:
             then = later(now, dt)
             x_leg, v_leg = _into_frame(then.laws, x_end, v_end, v_belt)
             kind = _event_due(then, mode, side, x_leg, v_leg, v_belt)
             if kind != NO_EVENT:
+                x_leg = _at_zero(then.laws, x_leg) if kind == SWITCHING else x_leg
                 after = _mode_after(then, mode, kind, x_leg, v_belt)
                 begun, arcs, touched = _pass_event(then, mode, after, kind, x_leg, v_leg, v_belt, vectors)
                 sticks += begun

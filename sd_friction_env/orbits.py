@@ -256,7 +256,7 @@ def traps_of(parameters: OscillatorParameters) -> FloatArray:
     A node is crept into without a maximum of x, so that the return map has nothing to say of it; a line in its phase
     plane hems it in. Where slip conserves energy, the trap of a centre is only the ball that counts as it.
     """
-    rows = []
+    plant, rows = parameters.plant, []
     for e in equilibria(parameters):
         centre = is_centre(parameters, e)
         stable = centre and e.damping > 0.0
@@ -267,8 +267,11 @@ def traps_of(parameters: OscillatorParameters) -> FloatArray:
         if stable and e.eigenvalues[0].imag == 0.0:
             # Of all lines the first asks for the least damping far out, the second lets the spring grow stiffest.
             for slope in (math.sqrt(max(e.stiffness, 0.0)), 0.5 * e.damping)[level:]:
-                nearest, farthest = _LEVEL_STEP if level else 0.1 * ball, 4.0 * (STATE_LIMIT + abs(e.x))
-                extents = kernel.trap_extents(parameters.plant, parameters.belt_speed, e.x, slope, nearest, farthest)
+                nearest, farthest = _LEVEL_STEP if level else 0.1 * ball, 2.0 * reach_of(parameters, e)
+                extents = (
+                    kernel.trap_extent(plant, parameters.belt_speed, e.x, slope, side, nearest, farthest)
+                    for side in (-1.0, 1.0)
+                )
                 rows.append((e.x, ball, slope, *extents))
     return np.array(rows, dtype=np.float64).reshape(len(rows), kernel.TRAP_ROW)
 
@@ -276,6 +279,11 @@ def traps_of(parameters: OscillatorParameters) -> FloatArray:
 def ball_of(equilibrium: Equilibrium) -> float:
     """Return how small orbits about an equilibrium are that are called the equilibrium."""
     return _SMALLEST_RADIUS * max(1.0, abs(equilibrium.x))
+
+
+def reach_of(parameters: OscillatorParameters, equilibrium: Equilibrium) -> float:
+    """Return a distance from an equilibrium beyond all that starts in range can reach in slip."""
+    return 4.0 * (2.0 * STATE_LIMIT + abs(equilibrium.x) + parameters.belt_speed)
 
 
 def is_centre(parameters: OscillatorParameters, equilibrium: Equilibrium) -> bool:
@@ -479,17 +487,13 @@ class ReturnMap:
             top *= 1.5
         grid = np.concatenate((np.geomspace(_SMALLEST_RADIUS, 0.01, 24), np.linspace(0.01, top, 80)[1:])).tolist()
         fine = [grid[0]]
-        for radius in [*grid[1:], self.reach(top)]:
+        for radius in [*grid[1:], max(top, reach_of(self.parameters, self.equilibrium))]:
             more = math.ceil(math.log(radius / fine[-1]) / math.log(_FINEST_RATIO)) if radius > fine[-1] else 0
             fine += [*np.geomspace(fine[-1], radius, max(more, 1) + 1)[1:-1].tolist(), radius]
         if math.isfinite(self.farthest):
             edge = self.farthest * (1.0 - np.geomspace(1e-6, 0.1, 12))
             fine = sorted(radius for radius in {*fine, *edge.tolist()} if 0.0 < radius < self.farthest)
         return [(radius, *self.lap(radius)) for radius in fine if radius > 1.5 * ball_of(self.equilibrium)]
-
-    def reach(self, top: float) -> float:
-        """Return a radius beyond all that starts in range can reach in slip."""
-        return max(top, 4.0 * (2.0 * STATE_LIMIT + abs(self.centre) + self.parameters.belt_speed))
 
     def ranges(self) -> list[LapRange]:
         """Return where the map is continuous, with its cycles, ascending.
@@ -546,7 +550,7 @@ class ReturnMap:
             return self.parted(kind, low, below) + self.parted(kind, begin, above)
         tendencies = []
         for inner, outer in itertools.pairwise([low, *cycles, high]):
-            between = [shift for radius, shift in known if inner < radius < outer]
+            between = [shift for radius, shift in known if inner <= radius <= outer]
             if not between and inner in cycles and outer in cycles:  # a pair close together
                 between = [self.shift(0.5 * (inner + outer), kind)]
             tendencies.append(int(np.sign(max(between, key=abs, default=0.0))))
@@ -633,7 +637,7 @@ def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: lis
     contracts = _slip_dissipates(parameters)
     growing = shift > 0.0 and not contracts
     factor = 1.2 if growing else 0.5
-    while (growing or factor * radius > 2.0 * ball_of(around[-1])) and radius < laps.reach(0.0):
+    while (growing or factor * radius > 2.0 * ball_of(around[-1])) and radius < reach_of(parameters, around[-1]):
         following, last = factor * radius, False
         while True:
             change = laps.shift(following, kind)

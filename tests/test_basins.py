@@ -202,7 +202,7 @@ def test_a_stick_interval_may_end_beyond_the_states_that_starts_may_have():
     [
         (EXACT.replace(alpha=0.43, g1=0.9, beta=0.25, mu_s=0.51, friction="coulomb", mu_k=0.05), 0.854, 2.761),
         (EXACT.replace(alpha=0.0, g1=1.06, beta=0.03, friction="hyperbolic", mu_s=0.06, delta=0.15), -1.966, -1.209),
-        (CUBIC.replace(alpha=0.4, g1=2.0, beta=0.03, mu_s=0.1), 0.3, 0.0),
+        (CUBIC.replace(alpha=0.4, g1=2.0, beta=0.03, mu_s=0.1), 0.0, -0.6),
     ],
 )
 def test_laps_round_both_wells_do_not_decide_the_well(parameters, x, v):

@@ -11,20 +11,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env import kernel
 from sd_friction_env.orbits import (
+    ContactLossError,
     LimitCycle,
     OrbitError,
-    ReturnMap,
     attractors,
     equilibria,
-    limit_cycle,
+    limit_of_motion,
+    limits_of_slip,
     same_motion,
     stick_intervals,
+    traps_of,
 )
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_number
 
 LOST_CONTACT, UNDECIDED = -1, -2
 
 _STARTS_WORTH_A_THREAD = 20_000
+_SAMPLED_MAXIMA = 15  # among those with which motions leave a range of radii
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,7 +37,7 @@ class Basins:
     Attributes:
         attractors: as :func:`sd_friction_env.orbits.attractors` lists them.
         labels: index into ``attractors`` of each start, of the shape of the starts; -1: the mass loses contact,
-            -2: not decided.
+            -2: not decided. A start on a neutral orbit has the index of its family, an entry of kind "neutral".
         parameters: of the oscillator.
     """
 
@@ -70,79 +73,73 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
         checked_number(name, float(worst), -STATE_LIMIT, STATE_LIMIT)
     found = list(attractors(parameters))
 
-    def label_of(cycle: LimitCycle) -> int:
-        for i, known in enumerate(found):
-            if same_motion(cycle, known):
-                return i
-        found.append(cycle)
-        return len(found) - 1
+    def label_of(cycle: LimitCycle | None) -> int:
+        alike = (i for i, known in enumerate(found) if cycle is not None and same_motion(cycle, known))
+        return next(alike, UNDECIDED)
 
     exits, exit_labels = [], []
     for _, right in stick_intervals(parameters):
         exits.append(right)
         try:
-            exit_labels.append(label_of(limit_cycle(parameters, right, parameters.belt_speed)))
-        except OrbitError:
+            exit_labels.append(label_of(limit_of_motion(parameters, right, parameters.belt_speed)))
+        except ContactLossError:
             exit_labels.append(LOST_CONTACT)
-    places = equilibria(parameters)
-    decided = [_decided_radii(parameters, place.x, found) for place in places]
-    width = max((len(rows) for rows in decided), default=0) + 1
+        except OrbitError:
+            exit_labels.append(UNDECIDED)
+    traps = traps_of(parameters)
+    trap_labels = [label_of(limit_of_motion(parameters, place, 0.0)) for place in traps[:, kernel.TRAP_X].tolist()]
+    places = [place.x for place in equilibria(parameters)]
+    limits = {places.index(centre): rows for centre, rows in limits_of_slip(parameters)}
+    width = max(map(len, limits.values()), default=0) + 1
     bounds = np.full((len(places), width), np.inf)
     bound_labels = np.full((len(places), width), UNDECIDED, dtype=np.int64)
-    for i, rows in enumerate(decided):
-        for j, (bound, label) in enumerate(rows):
-            bounds[i, j], bound_labels[i, j] = bound, label
+    for i, rows in limits.items():
+        bounds[i, : len(rows)] = [row.radius for row in rows]
+        bound_labels[i, : len(rows)] = [label_of(row.cycle) for row in rows]
     labels = np.empty(xs.size, dtype=np.int8)
     flat_x, flat_v = np.ascontiguousarray(xs).ravel(), np.ascontiguousarray(vs).ravel()
     known = (
-        np.array(exits),
+        np.array(exits, dtype=np.float64),
         np.array(exit_labels, dtype=np.int64),
-        np.array([place.x for place in places]),
+        traps,
+        np.array(trap_labels, dtype=np.int64),
+        np.array(places, dtype=np.float64),
         bounds,
         bound_labels,
     )
 
-    def classify(part: slice) -> None:
-        kernel.classify(parameters.plant, parameters.belt_speed, flat_x[part], flat_v[part], *known, labels[part])
+    def classify(x: NDArray[np.float64], v: NDArray[np.float64], into: NDArray[np.int8]) -> None:
+        kernel.classify(parameters.plant, parameters.belt_speed, x, v, *known, into)
+
+    def label_from(low: float, high: float) -> int:
+        """Return the label of all maxima between two places, UNDECIDED if they have not one."""
+        reached = np.empty(_SAMPLED_MAXIMA, dtype=np.int8)
+        classify(np.linspace(low, high, _SAMPLED_MAXIMA + 2)[1:-1], np.zeros(_SAMPLED_MAXIMA), reached)
+        return int(reached[0]) if (reached == reached[0]).all() else UNDECIDED
+
+    # Where all maxima drift out of a range of radii, what follows is known as soon as that of its neighbours is.
+    for _ in range(width):
+        before = bound_labels.copy()
+        for i, rows in limits.items():
+            for j, row in enumerate(rows):
+                if row.leaves is not None and bound_labels[i, j] == UNDECIDED:
+                    low, high = row.leaves
+                    bound_labels[i, j] = label_from(places[i] + low, places[i] + high)
+        if np.array_equal(bound_labels, before):
+            break
+
+    def classify_part(part: slice) -> None:
+        classify(flat_x[part], flat_v[part], labels[part])
 
     # Starts do not know of each other: any number of threads gives the same labels. Few starts are not worth one.
     threads = min(threads or os.cpu_count() or 1, xs.size // _STARTS_WORTH_A_THREAD)
     if threads < 2:
-        classify(slice(None))
+        classify_part(slice(None))
     else:
         edges = np.linspace(0, xs.size, 8 * threads + 1).astype(int).tolist()
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(classify, itertools.starmap(slice, itertools.pairwise(edges))))
+            list(pool.map(classify_part, itertools.starmap(slice, itertools.pairwise(edges))))
     return Basins(attractors=tuple(found), labels=labels.reshape(xs.shape), parameters=parameters)
-
-
-def _decided_radii(parameters: OscillatorParameters, centre: float, found: list[LimitCycle]) -> list[tuple[float, int]]:
-    """Return (bound, label) pairs: maxima of x between the last bound and this, from the centre, tend there."""
-    laps = ReturnMap(parameters, centre, centre)
-    radii, last = laps.cycles()
-
-    def label_at(radius: float) -> int:
-        for i, cycle in enumerate(found):
-            if cycle.kind in ("pure-slip", "steady-slip") and abs(cycle.x_max - centre - radius) < 1e-6:
-                return i
-        return UNDECIDED
-
-    if last == 0.0:  # no lap: a saddle, or a node that is crept into
-        return [(0.0, label_at(0.0))]
-    # Between neighbouring fixed points (the equilibrium is one, of radius 0) all maxima move the same way.
-    fixed = [0.0, *radii]
-    rows = []
-    for inner, outer in zip(fixed, [*radii, last], strict=True):
-        if not outer > inner:
-            continue
-        grows = laps.shift(0.5 * (inner + outer)) > 0.0
-        if not grows:
-            rows.append((outer, label_at(inner)))
-        elif outer != last or outer in radii:
-            rows.append((outer, label_at(outer)))
-        else:
-            rows.append((outer, UNDECIDED))
-    return rows
 
 
 def basin_grid(

@@ -70,9 +70,9 @@ def amplitude_curve(
         progress: called with the rows done and the rows in all after each row.
 
     Returns:
-        A table with the columns belt_speed, kind ("stick-slip", "pure-slip", "steady-slip", "rest" or "failed"),
-        amplitude, period, frequency, angular_frequency, stick_fraction, x_max, x_min, x_breakaway, x_restick, sticks,
-        forward_arcs, floquet_multiplier, x_start, v_start and note (why a row failed, else empty).
+        A table with the columns belt_speed, kind ("stick-slip", "pure-slip", "steady-slip", "neutral", "rest" or
+        "failed"), amplitude, period, frequency, angular_frequency, stick_fraction, x_max, x_min, x_breakaway,
+        x_restick, sticks, forward_arcs, floquet_multiplier, x_start, v_start and note (why a row failed, else empty).
 
     Raises:
         TypeError, ValueError: if an argument is not as said.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env import kernel
-from sd_friction_env.orbits import OrbitError, equilibria, limit_cycle
+from sd_friction_env.orbits import OrbitError, equilibria, limit_cycle, traps_of
 from sd_friction_env.parameters import EXCITATIONS, RANGES, STATE_LIMIT, OscillatorParameters, checked_number
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.tables import Table
@@ -333,13 +333,24 @@ def forced_orbit(
 
 
 def _lap(
-    parameters: OscillatorParameters, state: tuple[float, float], multiple: int, period: float, phase: float
+    parameters: OscillatorParameters,
+    state: tuple[float, float],
+    multiple: int,
+    period: float,
+    phase: float,
+    in_sections: bool = True,
 ) -> tuple[Any, FloatArray]:
     """Return what the kernel's walk does over ``multiple`` cycles, and the tangent map (2, 2)."""
     vectors = np.eye(2)
     events = np.empty((kernel.MAX_EVENTS, 4))
     end = kernel.walk(
-        _plant(parameters, phase * period), *state, parameters.belt_speed, multiple * period, events, vectors
+        _plant(parameters, phase * period),
+        *state,
+        parameters.belt_speed,
+        multiple * period,
+        events,
+        vectors,
+        in_sections,
     )
     return end, vectors.T
 
@@ -350,7 +361,8 @@ def _closed(
     """Return the orbit of this multiple that Newton's method finds from a state, or None."""
     start = np.array(state)
     for _ in range(_NEWTON_STEPS):
-        end, tangent = _lap(parameters, (float(start[0]), float(start[1])), multiple, period, phase)
+        place = float(start[0]), float(start[1])
+        end, tangent = _lap(parameters, place, multiple, period, phase, in_sections=False)
         if end[3] != kernel.OK:
             return None
         error = np.array(end[:2]) - start
@@ -365,7 +377,7 @@ def _closed(
             return None
     else:
         return None
-    place = float(start[0]), float(start[1])
+    end, tangent = _lap(parameters, place, multiple, period, phase)
     rows, _, _ = _followed(parameters, place, period, phase, 0, multiple, growing=False)
     points = np.concatenate((start[None, :], rows[:-1, :2]))
     for divisor in range(1, multiple):
@@ -468,6 +480,8 @@ def _passive_exponent(parameters: OscillatorParameters, x: float, v: float | Non
         place = min(equilibria(parameters), key=lambda e: abs(e.x - cycle.x_max))
         parts = sorted((value.real for value in place.eigenvalues), reverse=True)
         largest, exponents = parts[0], (parts[0], parts[1])
+    elif cycle.kind == "neutral":
+        largest, exponents = 0.0, (0.0, 0.0)
     elif cycle.kind == "rest":
         largest, exponents = 0.0, (0.0, -math.inf)
     else:
@@ -579,7 +593,7 @@ def _section_at(
             xs, vs, stuck = rows[:, kernel.R_X], rows[:, kernel.R_V], rows[:, kernel.R_STICK_TIME] / period
         else:
             places = np.empty(transient + cycles)
-            status, written = kernel.maxima(_plant(plant), *state, plant.belt_speed, places)
+            status, written = kernel.maxima(_plant(plant), *state, plant.belt_speed, places, traps_of(plant))
             if status != kernel.OK:
                 raise _lost(plant, *state, status, written)
             xs, vs, stuck = places[transient:], np.zeros(cycles), np.full(cycles, math.nan)

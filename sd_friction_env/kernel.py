@@ -1626,19 +1626,106 @@ REPEATED_BREAKAWAY, STILL_SLIPPING, AT_REST, ORBIT_LOST_CONTACT, ORBIT_UNDECIDED
 
 SAME_PLACE = 1e-9  # breakaway points closer than this are one
 STICK_PATIENCE = 1e12  # a belt this slow never brings a stuck mass to breakaway
-# Slip that takes longer from one turning point or landing to the next creeps into a node or past a fold.
+# Slip that takes longer from one turning point or landing to the next passes a fold, and is not decided.
 SLIP_PATIENCE = 2000.0
-STANDSTILL = 1e-9
+CREEP_PIECE = 30.0  # of slip, after which it is seen whether it creeps into a node
+STEPS_OF_A_PIECE, MOST_PIECES = 3e4, 400
 SETTLING_LAPS, SETTLING_EXITS = 8, 64  # before a passive motion that still slips is looked at more closely
+MOST_TURNINGS = 2000  # of one start, in `classify`
+TRAP_POINTS, TRAP_REFINEMENTS = 600, 5  # distances from a node at which its trap is seen to hold, and finer ones
+
+# A row of `traps` says which states certainly tend to a stable equilibrium.
+(TRAP_X, TRAP_BALL, TRAP_SLOPE, TRAP_LEFT, TRAP_RIGHT), TRAP_ROW = range(5), 5
 
 
 @compiled
-def settle(plant, v_belt, x, v, turnings, exits):
-    """Follow the passive motion until it breaks away where it did before, or slips through ``turnings`` maxima of x.
+def _hems_in(plant, v_belt, centre, slope, side, s):
+    """Whether, at a distance s to one side of a node, the line v = -slope (x - centre) hems in slip that nears it."""
+    x = centre + side * s
+    v = -side * slope * s
+    if spring(plant, x)[1] <= 0.0 or side * slip_forces(plant, SLIP_BACKWARD, x, 0.0, v_belt, 0.0)[0] >= 0.0:
+        return False
+    if v >= v_belt:
+        return slip_forces(plant, SLIP_BACKWARD, x, v_belt, v_belt, 0.0)[0] <= 0.0
+    return slope * slope * s - side * slip_forces(plant, SLIP_BACKWARD, x, v, v_belt, 0.0)[0] <= 0.0
+
+
+@compiled
+def trap_extent(plant, v_belt, centre, slope, side, nearest, farthest):
+    """Return how far to one side of a node the line v = -slope (x - centre) hems slip in.
+
+    Below the line a mass that nears the node cannot pass it: there the flow crosses the line towards v = 0, and v = 0
+    towards the line. Where the line is above the belt's speed, the mass must not land on the belt either.
+    """
+    low = 0.0
+    high = nearest
+    ratio = math.exp(math.log(farthest / nearest) / TRAP_POINTS)
+    while high <= farthest and _hems_in(plant, v_belt, centre, slope, side, high):
+        low = high
+        high = high * ratio
+    if low == 0.0 or high > farthest:
+        return low
+    for _ in range(TRAP_REFINEMENTS):
+        step = (high - low) / 32.0
+        for _ in range(31):
+            if not _hems_in(plant, v_belt, centre, slope, side, low + step):
+                break
+            low = low + step
+        high = low + step
+    return low
+
+
+@compiled
+def trap_of(traps, mode, x, v):
+    """Return which of the ``traps`` (m, TRAP_ROW) holds a state of slip, or -1."""
+    if mode != SLIP_BACKWARD:
+        return -1
+    for i in range(len(traps)):
+        ahead = traps[i, TRAP_X] - x
+        ball = traps[i, TRAP_BALL]
+        if abs(ahead) < ball and abs(v) < ball:
+            return i
+        extent = traps[i, TRAP_LEFT] if ahead > 0.0 else traps[i, TRAP_RIGHT]
+        if abs(ahead) <= extent and v * ahead >= 0.0 and abs(v) <= traps[i, TRAP_SLOPE] * abs(ahead):
+            return i
+    return -1
+
+
+@compiled
+def slip_to_section(plant, mode, x, v, v_belt, traps):
+    """Slip with a steady belt until v changes sign, v_rel returns to zero, contact is lost or one of the ``traps``
+    holds the motion. Return the time spent, x, v, the event (NO_EVENT: held, or not decided), the trap or -1, and the
+    integral of v^2."""
+    t = 0.0
+    int_v2 = 0.0
+    patience = SLIP_PATIENCE
+    for i in range(len(traps)):
+        if traps[i, TRAP_SLOPE] > 0.0:
+            patience = CREEP_PIECE
+    for _ in range(MOST_PIECES):
+        trap = trap_of(traps, mode, x, v)
+        if trap >= 0:
+            return t, x, v, NO_EVENT, trap, int_v2
+        rate = abs(2.0 * plant.beta + spring(plant, x)[1] * friction_slope(plant, mode, v - v_belt))
+        piece = min(patience, STEPS_OF_A_PIECE / max(rate, 1.0))
+        dt, x, v, event, dv2, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, piece, True)
+        t += dt
+        int_v2 += dv2
+        if event != NO_EVENT:
+            return t, x, v, event, -1, int_v2
+        if t >= SLIP_PATIENCE:
+            break
+    return t, x, v, NO_EVENT, trap_of(traps, mode, x, v), int_v2
+
+
+@compiled
+def settle(plant, v_belt, x, v, turnings, exits, traps):
+    """Follow the passive motion until it breaks away where it did before, slips through ``turnings`` maxima of x, or
+    one of the ``traps`` (m, TRAP_ROW) holds it.
 
     A mass that sticks forgets its past, so a repeated breakaway point closes a stick-slip cycle. ``exits`` is scratch
     space of shape (n,) for the breakaway points met. Return the outcome, x (the breakaway point, the last maximum or
-    the place of rest), the maximum before the last, and the minimum between.
+    the place of rest or of the equilibrium), the maximum before the last, and the minimum between.
     """
     mode = mode_of(plant, x, v, v_belt, 0.0, 0.0)
     n_exits = 0
@@ -1666,7 +1753,7 @@ def settle(plant, v_belt, x, v, turnings, exits):
             maxima = 0
             last_max = math.nan
             continue
-        _, x, v, event, _, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
+        _, x, v, event, trap, _ = slip_to_section(plant, mode, x, v, v_belt, traps)
         if event == LANDING:
             mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
         elif event == TURNING:
@@ -1681,8 +1768,8 @@ def settle(plant, v_belt, x, v, turnings, exits):
                 last_min = x
         elif event == CONTACT_LOSS:
             return ORBIT_LOST_CONTACT, x, math.nan, math.nan
-        elif event == NO_EVENT and abs(v) < STANDSTILL:
-            return AT_EQUILIBRIUM, x, math.nan, math.nan
+        elif trap >= 0:
+            return AT_EQUILIBRIUM, traps[trap, TRAP_X], math.nan, math.nan
         else:
             return ORBIT_UNDECIDED, x, math.nan, math.nan
     return ORBIT_UNDECIDED, x, math.nan, math.nan
@@ -1738,16 +1825,16 @@ def stick_slip_lap(plant, v_belt, x_exit):
 
 
 @compiled
-def next_maximum(plant, v_belt, x):
+def next_maximum(plant, v_belt, x, traps):
     """Return map of slip: from a maximum of x (v = 0) to the next one, without a stick between.
 
     Return the event that ended it (TURNING if a maximum was reached), the next maximum, the minimum between, the
-    time taken, the integral of v^2 and the number of forward arcs. A first arc that rises (x is no maximum) is not
-    followed: the event is NO_EVENT.
+    time taken, the integral of v^2 and the number of forward arcs. A first arc that rises (x is no maximum), or that
+    one of the ``traps`` (m, TRAP_ROW) holds, is not followed: the event is NO_EVENT.
     """
     mode = mode_of(plant, x, 0.0, v_belt, 0.0, 0.0)
     acceleration, _ = slip_forces(plant, mode, x, 0.0, v_belt, 0.0)
-    if mode != SLIP_BACKWARD or acceleration >= 0.0:
+    if mode != SLIP_BACKWARD or acceleration >= 0.0 or spring(plant, x)[1] <= 0.0:
         return NO_EVENT, math.nan, math.nan, math.nan, math.nan, 0
     v = 0.0
     t = 0.0
@@ -1755,7 +1842,7 @@ def next_maximum(plant, v_belt, x):
     x_low = math.nan
     forward_arcs = 0
     for _ in range(MAX_EVENTS):
-        dt, x, v, event, dv2, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
+        dt, x, v, event, _, dv2 = slip_to_section(plant, mode, x, v, v_belt, traps)
         t += dt
         int_v2 += dv2
         if event == LANDING:
@@ -1772,13 +1859,14 @@ def next_maximum(plant, v_belt, x):
 
 
 @compiled
-def slip_returns_to_stick(plant, v_belt, x):
-    """Whether a mass that breaks away at x sticks again before it has slipped through one more full lap."""
+def slip_returns_to_stick(plant, v_belt, x, traps):
+    """Whether a mass that breaks away at x sticks again before it has slipped through one more full lap, or is held by
+    one of the ``traps``."""
     v = v_belt
     mode = _breakaway_mode(plant, x, v_belt, 0.0, 0.0)
     maxima = 0
     for _ in range(MAX_EVENTS):
-        _, x, v, event, _, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
+        _, x, v, event, _, _ = slip_to_section(plant, mode, x, v, v_belt, traps)
         if event == LANDING:
             mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
             if mode == STICK:
@@ -1794,13 +1882,13 @@ def slip_returns_to_stick(plant, v_belt, x):
 
 
 @compiled
-def classify(plant, v_belt, xs, vs, exits, exit_labels, centres, bounds, bound_labels, labels):
+def classify(plant, v_belt, xs, vs, exits, exit_labels, traps, trap_labels, centres, bounds, bound_labels, labels):
     """Write the label of the attractor that each start (xs, vs) of shape (n,) reaches into ``labels``.
 
-    A start that sticks is carried to one of the ``exits`` and has its label. A start that slips round the equilibrium
-    ``centres[i]`` alone, from a maximum of x less than ``bounds[i, j]`` to its right, has ``bound_labels[i, j]`` for
-    the first such j (rows end with infinite bounds labelled below zero, "not decided yet"). -1: lost contact, -2: not
-    decided.
+    A start that sticks is carried to the next of the ``exits`` (ascending) and has its label; one that a trap holds
+    has the trap's. A start that slips from a maximum of x less than ``bounds[i, j]`` to the right of ``centres[i]``,
+    the next to its left, has ``bound_labels[i, j]`` for the first such j (rows end with infinite bounds labelled -2,
+    "not decided yet"). -1: lost contact, -2: not decided.
     """
     for n in range(len(xs)):
         x = xs[n]
@@ -1810,17 +1898,14 @@ def classify(plant, v_belt, xs, vs, exits, exit_labels, centres, bounds, bound_l
         if spring(plant, x)[1] <= 0.0:
             labels[n] = -1
             continue
-        for _ in range(2000):
+        for _ in range(MOST_TURNINGS):
             if mode == STICK:
-                dt, event = ride_across(plant, x, v_belt, STICK_PATIENCE)
-                x = x + v_belt * dt
-                best = 1e-6
                 for i in range(len(exits)):
-                    if abs(exits[i] - x) < best:
-                        best = abs(exits[i] - x)
+                    if x <= exits[i] + SAME_PLACE * max(1.0, abs(x)):
                         label = exit_labels[i]
+                        break
                 break
-            _, x, v, event, _, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
+            _, x, v, event, trap, _ = slip_to_section(plant, mode, x, v, v_belt, traps)
             if event == LANDING:
                 mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
             elif event == TURNING:
@@ -1833,18 +1918,14 @@ def classify(plant, v_belt, xs, vs, exits, exit_labels, centres, bounds, bound_l
                         j = 0
                         while x - centres[nearest] >= bounds[nearest, j]:
                             j += 1
-                        if bound_labels[nearest, j] >= 0:
+                        if bound_labels[nearest, j] != -2:
                             label = bound_labels[nearest, j]
                             break
-            elif event == NO_EVENT and abs(v) < STANDSTILL:
-                nearest = 0
-                for i in range(len(centres)):
-                    if abs(centres[i] - x) < abs(centres[nearest] - x):
-                        nearest = i
-                label = bound_labels[nearest, 0]
-                break
             else:
-                label = -1 if event == CONTACT_LOSS else -2
+                if trap >= 0:
+                    label = trap_labels[trap]
+                elif event == CONTACT_LOSS:
+                    label = -1
                 break
         labels[n] = label
 
@@ -3526,6 +3607,7 @@ TANGENT_STEP = 0.1  # of the shortest time in which the linearised motion change
 TANGENT_BEND = 1e-4  # by so much a step's coefficients may depart from straight lines, times its length
 TANGENT_SMALLEST_STEP = 1e-9
 MOST_CALLS = 256  # of advance in one walk, each of MAX_EVENTS events
+SECTION_TIME = 1e-8  # an event due within this time after a section is of the cycle that ends there
 
 # What `stroboscope` writes of a cycle.
 (R_X, R_V, R_MODE, R_STICK_TIME, R_STICKS, R_FORWARD_ARCS, R_X_MIN, R_X_MAX), CYCLE_ROW = range(8), 8
@@ -3650,9 +3732,52 @@ def saltation(plant, mode, after, kind, x, v, v_belt):
 
 
 @compiled
-def walk(plant, x, v, v_belt, duration, events, vectors):
+def _side_of(plant, x, v):
+    """Return the side of x = 0 on which a mass is, or, from a section on it, to which it moves."""
+    place = room_x(plant, x)
+    w = room_v(plant, v)
+    ahead = w if abs(place) <= SECTION_TIME * abs(w) else place
+    return 1.0 if ahead > 0.0 else -1.0
+
+
+@compiled
+def _event_due(plant, mode, side, x, v, v_belt):
+    """Return the kind of event that a motion in this mode, on this side of x = 0, meets within SECTION_TIME, or
+    NO_EVENT."""
+    w = room_v(plant, v)
+    if plant.geometry == DISCONTINUOUS and side * w < 0.0 and side * room_x(plant, x) <= SECTION_TIME * abs(w):
+        return SWITCHING
+    if mode == STICK:
+        for cone_side in (-1, 1):
+            excess, slope = _cone_excess(plant, cone_side, x, v_belt, 0.0, 0.0, 0.0)
+            if slope > 0.0 and excess >= -SECTION_TIME * slope:
+                return BREAKAWAY
+        return NO_EVENT
+    a = mode * _acceleration(plant, mode, x, v, v_belt)
+    if a < 0.0 and mode * (v - v_belt) <= -SECTION_TIME * a:
+        landed = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
+        return RESTICK if landed == STICK else (GRAZING if landed == mode else CROSSING)
+    return NO_EVENT
+
+
+@compiled
+def _pass_event(plant, mode, after, kind, x, v, v_belt, vectors):
+    """Carry tangents (n, 2) through an event. Return 1 or 0 each: for a stick and a forward arc that begins, and for
+    an event without a derivative."""
+    of_x, of_v, touched = saltation(plant, mode, after, kind, x, v, v_belt)
+    for i in range(len(vectors)):
+        vectors[i, 1] = of_x * vectors[i, 0] + of_v * vectors[i, 1]
+    arcs = 1 if after == SLIP_FORWARD and mode != SLIP_FORWARD else 0
+    return 1 if kind == RESTICK else 0, arcs, 1 if touched else 0
+
+
+@compiled
+def walk(plant, x, v, v_belt, duration, events, vectors, in_sections=True):
     """Follow a motion under excitation alone and carry tangents (n, 2) along it, if there are any.
 
+    ``in_sections``: an event on the section at either end, or due just after it, belongs to the motion that ends there:
+    its saltation is applied at the end, and not once more at the beginning of the motion that goes on from it. Without
+    it the tangents are the derivative of the end by the start.
     ``events`` (MAX_EVENTS, 4) is scratch space. Return x, v, the mode, the status, the time reached, the time stuck,
     the sticks and the forward-slip arcs that began, the least and greatest x, whether it ever stuck (the tangents then
     have one direction left) and the number of events without a derivative.
@@ -3665,7 +3790,12 @@ def walk(plant, x, v, v_belt, duration, events, vectors):
     x_min = x
     x_max = x
     ever_stuck = False
-    mode = STICK
+    x_leg, v_leg = _into_frame(plant.laws, x, v, v_belt)
+    mode = _mode_of(plant, x_leg, v_leg, v_belt, 0.0, 0.0)
+    side = _side_of(plant, x_leg, v_leg)
+    due = NO_EVENT
+    if in_sections:
+        due = _event_due(plant, mode, 1.0 if room_x(plant, x_leg) > 0.0 else -1.0, x_leg, v_leg, v_belt)
     status = EVENT_LIMIT
     for _ in range(MOST_CALLS):
         now = later(plant, t)
@@ -3679,7 +3809,7 @@ def walk(plant, x, v, v_belt, duration, events, vectors):
             end = events[n, 0] if n < n_events else dt
             if mode == STICK:
                 ever_stuck = True
-                for i in range(len(vectors)):
+                for i in range(len(vectors) if due != BREAKAWAY else 0):
                     vectors[i, 1] = 0.0
             elif len(vectors) > 0:
                 _carry_in_slip(later(now, begin), mode, x_leg, v_leg, v_belt, end - begin, vectors)
@@ -3689,14 +3819,29 @@ def walk(plant, x, v, v_belt, duration, events, vectors):
             kind = int(events[n, 1])
             x_leg, v_leg = _into_frame(then.laws, events[n, 2], events[n, 3], v_belt)
             after = _mode_after(then, mode, kind, x_leg, v_belt)
-            of_x, of_v, touched = saltation(then, mode, after, kind, x_leg, v_leg, v_belt)
-            singular += 1 if touched else 0
-            for i in range(len(vectors)):
-                vectors[i, 1] = of_x * vectors[i, 0] + of_v * vectors[i, 1]
-            sticks += 1 if kind == RESTICK else 0
-            forward_arcs += 1 if after == SLIP_FORWARD and mode != SLIP_FORWARD else 0
+            if kind == due and t + end <= 2.0 * SECTION_TIME:
+                due = NO_EVENT
+            else:
+                begun, arcs, touched = _pass_event(then, mode, after, kind, x_leg, v_leg, v_belt, vectors)
+                sticks += begun
+                forward_arcs += arcs
+                singular += touched
+            if kind == SWITCHING:
+                side = 1.0 if room_v(then, v_leg) > 0.0 else -1.0
             mode = after
             begin = end
+        if status == OK and in_sections:
+            then = later(now, dt)
+            x_leg, v_leg = _into_frame(then.laws, x_end, v_end, v_belt)
+            kind = _event_due(then, mode, side, x_leg, v_leg, v_belt)
+            if kind != NO_EVENT:
+                x_leg = _at_zero(then.laws, x_leg) if kind == SWITCHING else x_leg
+                after = _mode_after(then, mode, kind, x_leg, v_belt)
+                begun, arcs, touched = _pass_event(then, mode, after, kind, x_leg, v_leg, v_belt, vectors)
+                sticks += begun
+                forward_arcs += arcs
+                singular += touched
+                ever_stuck = ever_stuck or kind == RESTICK
         x = x_end
         v = v_end
         mode = mode_end
@@ -3797,9 +3942,10 @@ def reach(plant, xs, vs, v_belt, period, cycles, points, point_labels, tolerance
 
 
 @compiled
-def maxima(plant, x, v, v_belt, places):
-    """Follow a motion without excitation and write its maxima of x into ``places`` (n,); one that comes to rest, on
-    the belt or in slip, fills what is left with its place. Return the status and how many were written."""
+def maxima(plant, x, v, v_belt, places, traps):
+    """Follow a motion without excitation and write its maxima of x into ``places`` (n,); one that comes to rest on the
+    belt, or in slip where one of the ``traps`` (m, TRAP_ROW) holds it, fills what is left with its place. Return the
+    status and how many were written."""
     mode = mode_of(plant, x, v, v_belt, 0.0, 0.0)
     if spring(plant, x)[1] <= 0.0:
         return CONTACT_LOST, 0
@@ -3814,8 +3960,9 @@ def maxima(plant, x, v, v_belt, places):
             v = v_belt
             mode = STICK if rests else _breakaway_mode(plant, x, v_belt, 0.0, 0.0)
         else:
-            _, x, v, event, _, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, SLIP_PATIENCE, True)
-            rests = event == NO_EVENT and abs(v) < STANDSTILL
+            _, x, v, event, trap, _ = slip_to_section(plant, mode, x, v, v_belt, traps)
+            rests = trap >= 0
+            x = traps[trap, TRAP_X] if rests else x
             if event == LANDING:
                 mode = mode_at_zero_v_rel(plant, x, v_belt, 0.0, 0.0)
             elif event == TURNING:

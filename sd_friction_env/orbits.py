@@ -5,6 +5,7 @@ pure-slip cycle is a fixed point of the map from one maximum of x to the next. N
 matters near the end of oscillation, where transients decay ever more slowly.
 """
 
+import bisect
 import cmath
 import contextlib
 import functools
@@ -21,15 +22,23 @@ from sd_friction_env.parameters import EXCITATIONS, RANGES, STATE_LIMIT, Oscilla
 from sd_friction_env.simulation import amplitude
 from sd_friction_env.theory import FloatArray, cubic_wells, exact_wells
 
-Kind = Literal["stick-slip", "pure-slip", "steady-slip", "rest"]
+Kind = Literal["stick-slip", "pure-slip", "steady-slip", "neutral", "rest"]
 
 _LONG_SETTLING_LAPS = 800
 _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are called the equilibrium
+_FINEST_RATIO = 1.15  # of neighbouring radii at which a return map is sampled
+_LAP_ERROR = 1e-13  # of a return map, relative to max(1, |x|): what is less is rounding
+_MOST_SETTLINGS, _MOST_LAPS = 200, 2000
+_LEVEL, _LEVEL_STEP = 1e-9, 1e-4  # where a spring's stiffness is less, the force this far away says more
 _BELT_SPEED_ERROR = 1e-11  # v_b0 is given this much too low: on the very graze rounding decides whether a cycle sticks
 
 
 class OrbitError(ValueError):
     """The passive motion has no attractor that can be named: it loses contact, or does not settle."""
+
+
+class ContactLossError(OrbitError):
+    """The motion loses contact with the belt (N <= 0)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,13 +53,26 @@ class Equilibrium:
     eigenvalues: tuple[complex, complex]
     stable: bool
 
+    @property
+    def stiffness(self) -> float:
+        """Of small deviations, the product of the eigenvalues."""
+        return (self.eigenvalues[0] * self.eigenvalues[1]).real
+
+    @property
+    def damping(self) -> float:
+        """Of small deviations, minus the sum of the eigenvalues."""
+        return -(self.eigenvalues[0] + self.eigenvalues[1]).real
+
 
 @dataclass(frozen=True, kw_only=True)
 class LimitCycle:
     """An attractor of the passive oscillator (dimensionless; a steady state has amplitude 0 and no period).
 
     Attributes:
-        kind: "stick-slip", "pure-slip", "steady-slip" (the mass stands on the sliding belt) or "rest" (belt speed 0).
+        kind: "stick-slip", "pure-slip", "steady-slip" (the mass stands on the sliding belt), "rest" (belt speed 0) or
+            "neutral": one of a family of closed orbits, none of which attracts, for slip neither loses nor gains
+            energy there (beta = 0 and level friction). :func:`limit_cycle` gives the start's own orbit,
+            :func:`attractors` one entry for each family, its outermost orbit.
         amplitude: (x_max - x_min)/2.
         period, frequency, angular_frequency: T, 1/T and 2 pi/T; NaN for a steady state.
         stick_fraction: share of the period spent stuck.
@@ -59,7 +81,8 @@ class LimitCycle:
         x_phase0, v_phase0: the state counted as phase 0: breakaway in stick-slip, the maximum of x in pure slip.
         x_breakaway, x_restick: where stick ends and where it last began; NaN without stick.
         sticks, forward_arcs: how many sticks and forward-slip arcs one period has.
-        floquet_multiplier: 0 for stick-slip (superstable), the return map's slope for pure slip, NaN otherwise.
+        floquet_multiplier: 0 for stick-slip (superstable), the return map's slope for pure slip, 1 for a neutral
+            orbit, NaN otherwise.
         x_start, v_start: the start whose attractor this is.
         parameters: of the oscillator.
     """
@@ -205,39 +228,117 @@ def _check_unexcited(parameters: OscillatorParameters) -> None:
         )
 
 
+def conserves_energy(parameters: OscillatorParameters) -> bool:
+    """Whether slip on one side of the belt's speed neither loses nor gains energy: beta = 0 and level friction."""
+    return parameters.beta == 0.0 and _friction_is_level(parameters)
+
+
+def _friction_is_level(parameters: OscillatorParameters) -> bool:
+    """Whether friction in slip does not change with speed."""
+    law, mu_s = parameters.friction, parameters.mu_s
+    if law == "stribeck":
+        return mu_s == parameters.mu_m
+    if law == "hyperbolic":
+        return parameters.delta == 0.0 or mu_s == 0.0
+    return law == "coulomb" or (mu_s == parameters.mu_k and parameters.mu_v == 0.0)
+
+
+def _slip_dissipates(parameters: OscillatorParameters) -> bool:
+    """Whether every slip contracts: damping, and friction that nowhere falls with speed. Then no slip is a cycle."""
+    rising = parameters.friction == "exponential" and parameters.mu_s == parameters.mu_k
+    return (rising or _friction_is_level(parameters)) and not conserves_energy(parameters)
+
+
+@functools.lru_cache(maxsize=256)
+def traps_of(parameters: OscillatorParameters) -> FloatArray:
+    """Return a row for each equilibrium that attracts: which states are sure to end there, as ``kernel.trap_of`` reads.
+
+    A node is crept into without a maximum of x, so that the return map has nothing to say of it; a line in its phase
+    plane hems it in. Where slip conserves energy, the trap of a centre is only the ball that counts as it.
+    """
+    plant, rows = parameters.plant, []
+    for e in equilibria(parameters):
+        centre = is_centre(parameters, e)
+        stable = centre and e.damping > 0.0
+        if not stable and not (centre and conserves_energy(parameters)):
+            continue
+        ball, level = ball_of(e), e.stiffness <= _LEVEL
+        rows.append((e.x, ball, 0.0, 0.0, 0.0))
+        if stable and e.eigenvalues[0].imag == 0.0:
+            # Of all lines the first asks for the least damping far out, the second lets the spring grow stiffest.
+            for slope in (math.sqrt(max(e.stiffness, 0.0)), 0.5 * e.damping)[level:]:
+                nearest, farthest = _LEVEL_STEP if level else 0.1 * ball, 2.0 * reach_of(parameters, e)
+                extents = (
+                    kernel.trap_extent(plant, parameters.belt_speed, e.x, slope, side, nearest, farthest)
+                    for side in (-1.0, 1.0)
+                )
+                rows.append((e.x, ball, slope, *extents))
+    return np.array(rows, dtype=np.float64).reshape(len(rows), kernel.TRAP_ROW)
+
+
+def ball_of(equilibrium: Equilibrium) -> float:
+    """Return how small orbits about an equilibrium are that are called the equilibrium."""
+    return _SMALLEST_RADIUS * max(1.0, abs(equilibrium.x))
+
+
+def reach_of(parameters: OscillatorParameters, equilibrium: Equilibrium) -> float:
+    """Return a distance from an equilibrium beyond all that starts in range can reach in slip."""
+    return 4.0 * (2.0 * STATE_LIMIT + abs(equilibrium.x) + parameters.belt_speed)
+
+
+def is_centre(parameters: OscillatorParameters, equilibrium: Equilibrium) -> bool:
+    """Whether forces lead back to an equilibrium from both sides, so that slip can turn about it or creep into it."""
+    if abs(equilibrium.stiffness) > _LEVEL:
+        return equilibrium.stiffness > 0.0
+    plant, belt, x = parameters.plant, parameters.belt_speed, equilibrium.x
+    left, right = (
+        kernel.slip_forces(plant, kernel.SLIP_BACKWARD, x + side * _LEVEL_STEP, 0.0, belt, 0.0)[0] for side in (-1, 1)
+    )
+    return bool(left > 0.0 > right)
+
+
 def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | None = None) -> LimitCycle:
-    """Return the attractor that the passive oscillator reaches from (x, v).
+    """Return the attractor that the passive oscillator reaches from (x, v), or the neutral orbit that it is on.
 
     Args:
         parameters: of the oscillator.
         x, v: the start, in [-10, 10]; without them a mass set down at x = 0 moving with the belt.
 
     Raises:
-        OrbitError: if the motion loses contact (N <= 0) or does not settle.
+        ContactLossError: an OrbitError, if the motion loses contact (N <= 0).
+        OrbitError: if it does not settle.
         TypeError, ValueError: if x or v is not a number in its range, or the oscillator is excited.
     """
     _check_unexcited(parameters)
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
     v = parameters.belt_speed if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
+    return limit_of_motion(parameters, x, v)
+
+
+def limit_of_motion(parameters: OscillatorParameters, x: float, v: float) -> LimitCycle:
+    """Return what :func:`limit_cycle` does, from any state."""
     at_x, at_v = x, v
     laps = kernel.SETTLING_LAPS
-    for _ in range(40):
+    conserved, traps = conserves_energy(parameters), traps_of(parameters)
+    for _ in range(_MOST_SETTLINGS):
         outcome, place, previous, lowest = kernel.settle(
-            parameters.plant, parameters.belt_speed, at_x, at_v, laps, np.empty(kernel.SETTLING_EXITS)
+            parameters.plant, parameters.belt_speed, at_x, at_v, laps, np.empty(kernel.SETTLING_EXITS), traps
         )
         if outcome == kernel.REPEATED_BREAKAWAY:
             return _stick_slip(parameters, place, x, v)
         if outcome == kernel.AT_REST:
             return _steady(parameters, "rest", place, x, v)
         if outcome == kernel.ORBIT_LOST_CONTACT:
-            raise OrbitError(f"the mass loses contact with the belt at x = {place:.6g} (N <= 0); {parameters}")
+            raise ContactLossError(f"the mass loses contact with the belt at x = {place:.6g} (N <= 0); {parameters}")
         if outcome == kernel.AT_EQUILIBRIUM:
-            nearest = min((e.x for e in equilibria(parameters)), key=lambda e: abs(e - place), default=place)
-            return _steady(parameters, "steady-slip", nearest, x, v)
+            return _steady(parameters, "neutral" if conserved else "steady-slip", place, x, v)
         if outcome == kernel.ORBIT_UNDECIDED:
             break
+        if conserved and _is_neutral(parameters, place):
+            return _pure_slip(parameters, place, x, v, "neutral")
         around = [e for e in equilibria(parameters) if lowest <= e.x <= place]
-        if abs(place - previous) < kernel.TIME_ZERO and place - lowest > _SMALLEST_RADIUS:
+        repeats = abs(place - previous) < kernel.TIME_ZERO and place - lowest > _SMALLEST_RADIUS
+        if repeats and not (around and _drifts_past(parameters, place, around[-1])):
             return _pure_slip(parameters, place, x, v)
         if not around:
             at_x, at_v, laps = place, 0.0, _LONG_SETTLING_LAPS
@@ -251,6 +352,18 @@ def limit_cycle(parameters: OscillatorParameters, x: float = 0.0, v: float | Non
             return _steady(parameters, "steady-slip", place, x, v)
         at_x, at_v = place, 0.0
     raise OrbitError(f"the motion from x = {x!r}, v = {v!r} does not settle; {parameters}")
+
+
+def _is_frictionless(parameters: OscillatorParameters) -> bool:
+    """Whether level friction is none at all, so that a lap on both sides of the belt's speed loses nothing either."""
+    return bool(kernel.friction_coefficient(parameters.plant, kernel.SLIP_BACKWARD, -parameters.belt_speed) == 0.0)
+
+
+def _is_neutral(parameters: OscillatorParameters, x_max: float) -> bool:
+    """Whether a lap from a maximum of x neither loses nor gains energy, where slip on one side does not."""
+    plant, speed = parameters.plant, parameters.belt_speed
+    event, *_, forward_arcs = kernel.next_maximum(plant, speed, x_max, traps_of(parameters))
+    return bool(event == kernel.TURNING and (forward_arcs == 0 or _is_frictionless(parameters)))
 
 
 def root(function: Callable[[float], float], low: float, high: float) -> float:
@@ -268,130 +381,335 @@ class _NoLapError(Exception):
         self.radius = radius
 
 
+LapKind = tuple[int, int]  # how many equilibria are left of the orbit, and how many forward arcs it has
+
+
+@dataclass(frozen=True, kw_only=True)
+class LapRange:
+    """Radii between which the return map is continuous.
+
+    Attributes:
+        ends: the first radius and the last; the first is 0 where the range begins at the equilibrium.
+        after: the radii of the maxima that follow on these.
+        cycles: its fixed points between, ascending.
+        tendencies: of the maxima between one of these radii and the next: 1 outwards, -1 inwards, 0 not resolved.
+        kind: of its laps.
+    """
+
+    ends: tuple[float, float]
+    after: tuple[float, float]
+    cycles: tuple[float, ...]
+    tendencies: tuple[int, ...]
+    kind: LapKind
+
+
 class ReturnMap:
     """The map from one maximum of x to the next in slip, by the radius: the distance of the maximum from a centre.
 
-    ``centre`` is the right-most equilibrium circled, ``innermost`` the left-most.
+    The maximum is between the centre, an equilibrium, and the next equilibrium to its right, and so is the next one.
     """
 
-    def __init__(self, parameters: OscillatorParameters, innermost: float, centre: float) -> None:
-        self.plant, self.speed = parameters.plant, parameters.belt_speed
-        self.innermost, self.centre = innermost, centre
+    def __init__(self, parameters: OscillatorParameters, centre: Equilibrium) -> None:
+        self.parameters, self.equilibrium, self.centre = parameters, centre, centre.x
+        self.places = [e.x for e in equilibria(parameters)]
+        right = [x for x in self.places if x > centre.x]
+        if parameters.geometry_code == kernel.DISCONTINUOUS and centre.x < 0.0:
+            right.insert(0, 0.0)  # the spring's switch parts the wells
+        self.farthest = right[0] - centre.x if right else math.inf
+        self.traps = traps_of(parameters)
 
-    def shift(self, radius: float) -> float:
-        """Return how much one lap adds to a radius; NaN if the lap sticks or does not circle just these equilibria."""
-        event, following, low = kernel.next_maximum(self.plant, self.speed, self.centre + radius)[:3]
-        if event != kernel.TURNING or not low <= self.innermost:
-            return math.nan
-        return float(following - self.centre - radius)
+    def lap(self, radius: float) -> tuple[LapKind | None, float]:
+        """Return the kind of a lap and how much it adds to a radius: None and NaN where there is no lap."""
+        event, following, low, _, _, forward_arcs = kernel.next_maximum(
+            self.parameters.plant, self.parameters.belt_speed, self.centre + radius, self.traps
+        )
+        if event != kernel.TURNING or not 0.0 < following - self.centre < self.farthest or not low <= self.centre:
+            return None, math.nan
+        arcs = 0 if self.parameters.mu_s == 0.0 else forward_arcs  # without friction the belt's speed parts nothing
+        return (bisect.bisect_left(self.places, low), arcs), float(following - self.centre - radius)
 
-    def edge(self, inside: float, outside: float) -> float:
-        """Return the last radius with a lap, between one that has it and one that has not."""
+    def shift(self, radius: float, kind: LapKind | None) -> float:
+        """Return how much one lap of this kind (None: of any) adds to a radius, NaN if there is none."""
+        found, change = self.lap(radius)
+        return change if kind in (None, found) else math.nan
+
+    def edge(self, kind: LapKind | None, inside: float, outside: float) -> float:
+        """Return the last radius with a lap of this kind, between one that has it and one that has not."""
         while True:
             middle = 0.5 * (inside + outside)
             if middle in (inside, outside) or abs(outside - inside) < 1e-15:
                 return inside
-            if math.isnan(self.shift(middle)):
+            if math.isnan(self.shift(middle, kind)):
                 outside = middle
             else:
                 inside = middle
 
-    def root(self, low: float, high: float) -> float:
+    def root(self, kind: LapKind | None, low: float, high: float) -> float:
         """Return the radius of the cycle between two radii whose shifts differ in sign.
 
         Raises:
-            _NoLapError: if a radius between, met on the way, has no lap.
+            _NoLapError: if a radius between, met on the way, has no lap of this kind.
         """
 
         def shift(radius: float) -> float:
-            change = self.shift(radius)
+            change = self.shift(radius, kind)
             if math.isnan(change):
                 raise _NoLapError(radius)
             return change
 
         return root(shift, low, high)
 
-    def roots(self, low: float, high: float) -> list[float]:
-        """Return the radii of cycles between two radii that have laps: none where their shifts have the same sign."""
-        if self.shift(low) * self.shift(high) >= 0.0:
-            return []
-        try:
-            return [self.root(low, high)]
-        except _NoLapError as gap:
-            return self.roots(low, self.edge(low, gap.radius)) + self.roots(self.edge(high, gap.radius), high)
+    def resolved(self, radius: float, shift: float) -> bool:
+        """Whether a shift is more than rounding."""
+        return abs(shift) > _LAP_ERROR * max(1.0, abs(self.centre + radius))
 
-    def cycles(self) -> tuple[list[float], float]:
-        """Return the radii of all cycles, ascending, and the largest radius with a lap.
+    def leaving(self, radius: float, kind: LapKind) -> float | None:
+        """Return the first radius without a lap of this kind that follows on one, None after too many laps."""
+        for _ in range(_MOST_LAPS):
+            change = self.shift(radius, kind)
+            if math.isnan(change):
+                return radius
+            radius += change
+        return None
 
-        The map is sampled on some hundred radii; where it comes near zero without crossing it, its extremum is looked
-        for, so that a pair of cycles about to merge is not stepped over.
-        """
+    def first_resolved(self, radius: float, kind: LapKind | None) -> float:
+        """Return the shift of the first orbit from a radius outwards of which it is more than rounding, or NaN."""
+        shift = self.shift(radius, kind)
+        while not (math.isnan(shift) or self.resolved(radius, shift)):
+            radius *= 1.5
+            shift = self.shift(radius, kind)
+        return shift
+
+    def samples(self) -> list[tuple[float, LapKind | None, float]]:
+        """Return radii, ascending, with their laps: up to beyond all that starts can reach."""
         top = 0.05
-        while top < 2.0 * STATE_LIMIT and not math.isnan(self.shift(top)):
+        while top < 2.0 * STATE_LIMIT and not math.isnan(self.shift(top, None)):
             top *= 1.5
         grid = np.concatenate((np.geomspace(_SMALLEST_RADIUS, 0.01, 24), np.linspace(0.01, top, 80)[1:])).tolist()
-        laps = [(radius, self.shift(radius)) for radius in grid]
-        samples = [(radius, shift) for radius, shift in laps if not math.isnan(shift)]
-        if not samples:
-            return [], 0.0
-        beyond = [radius for radius, shift in laps if math.isnan(shift) and radius > samples[-1][0]]
-        if beyond:
-            last = self.edge(samples[-1][0], beyond[0])
-            samples.append((last, self.shift(last)))
+        fine = [grid[0]]
+        for radius in [*grid[1:], max(top, reach_of(self.parameters, self.equilibrium))]:
+            more = math.ceil(math.log(radius / fine[-1]) / math.log(_FINEST_RATIO)) if radius > fine[-1] else 0
+            fine += [*np.geomspace(fine[-1], radius, max(more, 1) + 1)[1:-1].tolist(), radius]
+        if math.isfinite(self.farthest):
+            edge = self.farthest * (1.0 - np.geomspace(1e-6, 0.1, 12))
+            fine = sorted(radius for radius in {*fine, *edge.tolist()} if 0.0 < radius < self.farthest)
+        return [(radius, *self.lap(radius)) for radius in fine if radius > 1.5 * ball_of(self.equilibrium)]
+
+    def ranges(self) -> list[LapRange]:
+        """Return where the map is continuous, with its cycles, ascending.
+
+        Where samples come near zero without crossing it, the extremum is looked for, so that a pair of cycles about to
+        merge is not stepped over.
+        """
+        samples = self.samples()
+        found: list[LapRange] = []
+        first = 0
+        while first < len(samples):
+            kind = samples[first][1]
+            last = first
+            while last + 1 < len(samples) and samples[last + 1][1] == kind:
+                last += 1
+            if kind is not None:
+                inside = [(radius, shift) for radius, _, shift in samples[first : last + 1]]
+                if first == 0:
+                    low = 0.0
+                else:
+                    low = self.edge(kind, inside[0][0], samples[first - 1][0])
+                    inside.insert(0, (low, self.shift(low, kind)))
+                if last + 1 < len(samples):
+                    high = self.edge(kind, inside[-1][0], samples[last + 1][0])
+                    inside.append((high, self.shift(high, kind)))
+                found += self.parted(kind, low, inside)
+            first = last + 1
+        return found
+
+    def parted(self, kind: LapKind, low: float, inside: list[tuple[float, float]]) -> list[LapRange]:
+        """Return the ranges that samples (radius, shift) of one kind of lap belong to: one, but for gaps met on the
+        way. ``low`` is where the first begins."""
+        high = inside[-1][0]
+        ends, after = (low, high), (low + inside[0][1], high + inside[-1][1])
+        if conserves_energy(self.parameters) or _slip_dissipates(self.parameters):
+            neutral = conserves_energy(self.parameters) and (kind[1] == 0 or _is_frictionless(self.parameters))
+            return [LapRange(ends=ends, after=after, cycles=(), tendencies=(0 if neutral else -1,), kind=kind)]
+        known = [(radius, shift) for radius, shift in inside if self.resolved(radius, shift)]
+        try:
+            cycles = self.cycles(kind, known)
+            first = 0
+            if low == 0.0 and not self.is_weak:
+                # The equilibrium is a fixed point too: its linearisation says what rounding hides of small orbits.
+                first = -1 if self.equilibrium.damping > 0.0 else 1
+                if known and known[0][1] * first < 0.0:
+                    like = [radius for radius, shift in inside if radius < known[0][0] and shift * first > 0.0]
+                    cycles = [self.root(kind, like[-1], known[0][0]), *cycles] if like else cycles
+        except _NoLapError as gap:
+            inner = max(radius for radius, _ in inside if radius < gap.radius)
+            outer = min(radius for radius, _ in inside if radius > gap.radius)
+            end, begin = self.edge(kind, inner, gap.radius), self.edge(kind, outer, gap.radius)
+            below = [*(lap for lap in inside if lap[0] < gap.radius), (end, self.shift(end, kind))]
+            above = [(begin, self.shift(begin, kind)), *(lap for lap in inside if lap[0] > gap.radius)]
+            return self.parted(kind, low, below) + self.parted(kind, begin, above)
+        tendencies = []
+        for inner, outer in itertools.pairwise([low, *cycles, high]):
+            between = [shift for radius, shift in known if inner <= radius <= outer]
+            if not between and inner in cycles and outer in cycles:  # a pair close together
+                between = [self.shift(0.5 * (inner + outer), kind)]
+            tendencies.append(int(np.sign(max(between, key=abs, default=0.0))))
+        if tendencies[0] == 0:
+            tendencies[0] = first
+        return [LapRange(ends=ends, after=after, cycles=tuple(cycles), tendencies=tuple(tendencies), kind=kind)]
+
+    @property
+    def is_weak(self) -> bool:
+        """Whether the equilibrium's linearisation is neutral, so that its curvature decides."""
+        return abs(self.equilibrium.damping) <= 1e-13 * max(abs(value) for value in self.equilibrium.eigenvalues)
+
+    def cycles(self, kind: LapKind | None, known: list[tuple[float, float]]) -> list[float]:
+        """Return the radii of cycles among samples (radius, shift) of one kind of lap.
+
+        Raises:
+            _NoLapError: if a radius between, met on the way, has no lap of this kind.
+        """
         from scipy.optimize import minimize_scalar
 
-        radii = [radius for (r0, _), (r1, _) in itertools.pairwise(samples) for radius in self.roots(r0, r1)]
-        for (r0, s0), (_, s1), (r2, s2) in zip(samples, samples[1:], samples[2:], strict=False):
+        radii = [self.root(kind, r0, r1) for (r0, s0), (r1, s1) in itertools.pairwise(known) if s0 * s1 < 0.0]
+        for (r0, s0), (_, s1), (r2, s2) in zip(known, known[1:], known[2:], strict=False):
             if s0 * s1 > 0.0 and s1 * s2 > 0.0 and abs(s1) < min(abs(s0), abs(s2)):
                 side = math.copysign(1.0, s1)
-                nearest = minimize_scalar(lambda r, side=side: side * self.shift(r), bounds=(r0, r2), method="bounded")
-                if nearest.fun < 0.0:
-                    radii += self.roots(r0, nearest.x) + self.roots(nearest.x, r2)
-        return sorted(radii), samples[-1][0]
+
+                def height(radius: float, side: float = side) -> float:
+                    return side * self.shift(radius, kind)
+
+                nearest = minimize_scalar(height, bounds=(r0, r2), method="bounded")
+                if nearest.fun < 0.0 and self.resolved(nearest.x, nearest.fun):
+                    radii += [self.root(kind, r0, nearest.x), self.root(kind, nearest.x, r2)]
+        return sorted(radii)
+
+
+class Section(NamedTuple):
+    """The maxima of x right of one equilibrium: whether it attracts those next to it, and its map's ranges."""
+
+    equilibrium: Equilibrium
+    attracts: bool
+    ranges: list[LapRange]
+
+
+@functools.lru_cache(maxsize=64)
+def sections(parameters: OscillatorParameters) -> list[Section]:
+    """Return the section of every equilibrium that slip can turn about, in ascending order."""
+    found = []
+    for equilibrium in equilibria(parameters):
+        if not is_centre(parameters, equilibrium):
+            continue
+        laps = ReturnMap(parameters, equilibrium)
+        ranges = laps.ranges()
+        attracts = equilibrium.damping > 0.0
+        if laps.is_weak:
+            attracts = bool(ranges) and ranges[0].ends[0] == 0.0 and ranges[0].tendencies[0] < 0
+        found.append(Section(equilibrium, attracts, ranges))
+    return found
+
+
+def _drifts_past(parameters: OscillatorParameters, place: float, centre: Equilibrium) -> bool:
+    """Whether maxima on both sides of one that repeats but for rounding move the same way, so that it is no cycle."""
+    if _slip_dissipates(parameters):
+        return True
+    laps = ReturnMap(parameters, centre)
+    radii = [(place - centre.x) * (1.0 + part) for part in (-0.01, 0.01)]
+    below, above = ((radius, laps.shift(radius, None)) for radius in radii)
+    if math.isnan(below[1] + above[1]):  # one of them sticks: the cycle touches the belt's speed
+        return False
+    return not (below[1] * above[1] < 0.0 and laps.resolved(*below) and laps.resolved(*above))
 
 
 def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: list[Equilibrium]) -> tuple[str, float]:
     """Return where successive maxima of x tend from ``maximum``, which has a next one: ("pure-slip", fixed point),
     ("steady-slip", x) or ("on", the first maximum on the way from which the motion sticks or circles other equilibria).
     """
-    laps = ReturnMap(parameters, around[0].x, around[-1].x)
+    laps = ReturnMap(parameters, around[-1])
     centre = laps.centre
-    radius = maximum - centre
-    shift = laps.shift(radius)
-    if math.isnan(shift):
+    first = radius = maximum - centre
+    kind, shift = laps.lap(radius)
+    if kind is None:
         return "on", maximum
-    growing = shift > 0.0
+    if not laps.resolved(radius, shift):
+        # Of small orbits, lost in rounding, the equilibrium's linearisation says what they do, or greater ones.
+        shift = -around[-1].damping if not laps.is_weak else laps.first_resolved(radius, kind)
+    contracts = _slip_dissipates(parameters)
+    growing = shift > 0.0 and not contracts
     factor = 1.2 if growing else 0.5
-    while _SMALLEST_RADIUS < radius < 2.0 * STATE_LIMIT:
+    while (growing or factor * radius > 2.0 * ball_of(around[-1])) and radius < reach_of(parameters, around[-1]):
         following, last = factor * radius, False
         while True:
-            change = laps.shift(following)
+            change = laps.shift(following, kind)
             if math.isnan(change):
                 # Up to the last orbit with a lap there can still be a cycle; if there is none, the motion passes it.
-                following, last = laps.edge(radius, following), True
-                change = laps.shift(following)
-            if (change > 0.0) == growing:
+                following, last = laps.edge(kind, radius, following), True
+                change = laps.shift(following, kind)
+            if (change > 0.0) == growing or contracts or not laps.resolved(following, change):
                 break
             try:
-                return "pure-slip", centre + laps.root(radius, following)
+                return "pure-slip", centre + laps.root(kind, radius, following)
             except _NoLapError as gap:
                 following = gap.radius
         if last:
-            return "on", centre + following * (1.0 + (1e-12 if growing else -1e-12))
+            beyond = following * (1.0 + (1e-12 if growing else -1e-12))
+            # With several wells it matters where the motion itself passes the edge.
+            return "on", centre + (laps.leaving(first, kind) or beyond if len(laps.places) > 1 else beyond)
         radius = following
     return ("on", centre + radius) if growing else ("steady-slip", centre)
 
 
 def slip_cycles(parameters: OscillatorParameters) -> list[LimitCycle]:
-    """Return every pure-slip cycle that circles one steady-slip equilibrium, stable (|multiplier| < 1) and unstable.
-
-    The start recorded with each is its own maximum of x.
+    """Return every pure-slip cycle, stable (|multiplier| < 1) and unstable: by the equilibrium left of its maximum of
+    x, then by size. The start recorded with each is its own maximum of x.
     """
     found = []
-    for equilibrium in equilibria(parameters):
-        radii, _ = ReturnMap(parameters, equilibrium.x, equilibrium.x).cycles()
-        places = [equilibrium.x + radius for radius in radii]
+    for section in sections(parameters):
+        places = [section.equilibrium.x + radius for part in section.ranges for radius in part.cycles]
         found += [_pure_slip(parameters, place, place, 0.0) for place in places]
+    return found
+
+
+class SlipLimit(NamedTuple):
+    """What maxima of x tend to that are nearer to an equilibrium than ``radius``, but not nearer than the last limit's.
+
+    Either ``cycle``, or they leave these radii, with a maximum between the two radii ``leaves``, or (both None) it is
+    not known.
+    """
+
+    radius: float
+    cycle: LimitCycle | None = None
+    leaves: tuple[float, float] | None = None
+
+
+@functools.lru_cache(maxsize=64)
+def limits_of_slip(parameters: OscillatorParameters) -> list[tuple[float, list[SlipLimit]]]:
+    """Return the limits of maxima of x right of each equilibrium that slip can turn about, by ascending radius."""
+    found = []
+    for section in sections(parameters):
+        centre = section.equilibrium.x
+        limits: list[SlipLimit] = []
+        for part in section.ranges:
+            low, high = part.ends
+            if low > 0.0:
+                limits.append(SlipLimit(low))
+            if conserves_energy(parameters) and part.tendencies == (0,):
+                # A little inside: on the very edge, where the orbit touches the belt's speed, rounding decides.
+                place = centre + high - 1e-9 * (high - low)
+                limits.append(SlipLimit(high, _pure_slip(parameters, place, place, 0.0, "neutral")))
+                continue
+            orbits = [_pure_slip(parameters, centre + radius, centre + radius, 0.0) for radius in part.cycles]
+            steady = _steady(parameters, "steady-slip", centre, centre, 0.0)
+            # A range's first radius and its last are fixed points only where the first is the equilibrium.
+            inmost = SlipLimit(high, *((steady, None) if low == 0.0 else (None, (part.after[0], low))))
+            outmost = SlipLimit(high, None, (high, part.after[1]))
+            marks = [inmost, *(SlipLimit(high, orbit) for orbit in orbits), outmost]
+            for radius, tendency, (inner, outer) in zip(
+                (*part.cycles, high), part.tendencies, itertools.pairwise(marks), strict=True
+            ):
+                limit = (SlipLimit(radius), outer, inner)[tendency]
+                limits.append(limit._replace(radius=radius))
+        found.append((centre, limits))
     return found
 
 
@@ -417,8 +735,8 @@ def attractors(parameters: OscillatorParameters) -> list[LimitCycle]:
     """Return every attractor, each with a start that reaches it, in ascending order of the middle of its motion.
 
     A mass that sticks leaves from the right end of a stick interval, so the stick-slip cycles are found by following
-    each of those ends once; what does not stick tends to a stable equilibrium or to a stable pure-slip cycle. (Cycles
-    of pure slip round several equilibria are found only if a stick interval's end leads there.)
+    each of those ends once; what does not stick tends to a stable equilibrium or to a stable pure-slip cycle, or is
+    one of a family of neutral orbits: each family is listed once, as its outermost orbit, of kind "neutral".
 
     Raises:
         ValueError: if the belt stands still: then every place in a stick interval is one of rest.
@@ -431,21 +749,33 @@ def attractors(parameters: OscillatorParameters) -> list[LimitCycle]:
         if not any(same_motion(cycle, other) for other in found):
             found.append(cycle)
 
+    of_slip = [limit.cycle for _, limits in limits_of_slip(parameters) for limit in limits if limit.cycle is not None]
+    for cycle in of_slip:
+        if cycle.kind == "neutral":
+            add(cycle)
     for _, right in stick_intervals(parameters):
         with contextlib.suppress(OrbitError):
-            add(limit_cycle(parameters, right, parameters.belt_speed))
-    for equilibrium in equilibria(parameters):
-        if equilibrium.stable:
-            add(_steady(parameters, "steady-slip", equilibrium.x, equilibrium.x, 0.0))
-    for cycle in slip_cycles(parameters):
-        if abs(cycle.floquet_multiplier) < 1.0:
-            add(cycle)
+            add(limit_of_motion(parameters, right, parameters.belt_speed))
+    for section in sections(parameters):
+        if section.attracts:
+            add(_steady(parameters, "steady-slip", section.equilibrium.x, section.equilibrium.x, 0.0))
+    for cycle in of_slip:
+        add(cycle)
     return sorted(found, key=lambda cycle: cycle.x_max + cycle.x_min)
 
 
 def same_motion(a: LimitCycle, b: LimitCycle) -> bool:
-    """Whether two attractors of one oscillator are the same."""
-    return a.kind == b.kind and abs(a.x_max - b.x_max) < 1e-6 and abs(a.x_min - b.x_min) < 1e-6
+    """Whether two attractors of one oscillator are the same, or two neutral orbits of one family."""
+    if a.kind != b.kind:
+        return False
+    if a.kind == "neutral":
+        places, arcs = [e.x for e in equilibria(a.parameters)], a.parameters.mu_s > 0.0
+        first, second = (
+            ([cycle.x_min <= x <= cycle.x_max for x in places], arcs and cycle.forward_arcs) for cycle in (a, b)
+        )
+        return first == second
+    close = 1e-6 * min(1.0, max(1e-3, a.amplitude))
+    return abs(a.x_max - b.x_max) < close and abs(a.x_min - b.x_min) < close
 
 
 def _stick_slip(parameters: OscillatorParameters, x_exit: float, x: float, v: float) -> LimitCycle:
@@ -477,21 +807,23 @@ def _stick_slip(parameters: OscillatorParameters, x_exit: float, x: float, v: fl
     )
 
 
-def _pure_slip(parameters: OscillatorParameters, x_max: float, x: float, v: float) -> LimitCycle:
-    plant, speed = parameters.plant, parameters.belt_speed
-    event, _, x_min, period, int_v2, forward_arcs = kernel.next_maximum(plant, speed, x_max)
+def _pure_slip(
+    parameters: OscillatorParameters, x_max: float, x: float, v: float, kind: Kind = "pure-slip"
+) -> LimitCycle:
+    plant, speed, traps = parameters.plant, parameters.belt_speed, traps_of(parameters)
+    event, _, x_min, period, int_v2, forward_arcs = kernel.next_maximum(plant, speed, x_max, traps)
     if event != kernel.TURNING:
         raise OrbitError(f"the cycle of slip through x = {x_max!r} does not close; {parameters}")
     if x_max - x_min < _SMALLEST_RADIUS:
-        return _steady(parameters, "steady-slip", x_max, x, v)
+        return _steady(parameters, "steady-slip" if kind == "pure-slip" else kind, x_max, x, v)
     step = 1e-4 * (x_max - x_min)
-    above = kernel.next_maximum(plant, speed, x_max + step)[1]
-    below = kernel.next_maximum(plant, speed, x_max - step)[1]
+    above = kernel.next_maximum(plant, speed, x_max + step, traps)[1]
+    below = kernel.next_maximum(plant, speed, x_max - step, traps)[1]
     multiplier = (above - below) / (2.0 * step)
     if math.isnan(multiplier):  # the orbit just above sticks
         multiplier = (x_max - below) / step
     return LimitCycle(
-        kind="pure-slip",
+        kind=kind,
         amplitude=amplitude(x_min, x_max),
         period=period,
         frequency=1.0 / period,
@@ -506,7 +838,7 @@ def _pure_slip(parameters: OscillatorParameters, x_max: float, x: float, v: floa
         x_restick=math.nan,
         sticks=0,
         forward_arcs=forward_arcs,
-        floquet_multiplier=multiplier,
+        floquet_multiplier=multiplier if kind == "pure-slip" else 1.0,
         x_start=x,
         v_start=v,
         parameters=parameters,
@@ -630,7 +962,8 @@ def grazing_belt_speed(parameters: OscillatorParameters) -> float:
         ends = balance_points(parameters, 2.0 * parameters.beta * speed, parameters.mu_s)
         if not ends or kernel.spring(plant, ends[-1])[1] <= 0.0:
             return False
-        return bool(kernel.slip_returns_to_stick(plant, speed, ends[-1]))
+        traps = traps_of(parameters.replace(belt_speed=speed))
+        return bool(kernel.slip_returns_to_stick(plant, speed, ends[-1], traps))
 
     _check_unexcited(parameters)
     if parameters.friction == "stribeck":

@@ -23,6 +23,7 @@ BRANCHES = {
     "stick-slip": {"color": BLUE, "linestyle": "-", "linewidth": 2.2, "label": r"stick-slip, $A_0$"},
     "pure-slip": {"color": VERMILION, "linestyle": (0, (4, 1.2)), "linewidth": 2.2, "label": r"pure slip, $A_1$"},
     "steady-slip": {"color": GREY, "linestyle": ":", "linewidth": 1.8, "label": "steady slip"},
+    "neutral": {"color": GREEN, "linestyle": "-.", "linewidth": 1.8, "label": "neutral, as started"},
 }
 PAIR = ({"color": BLUE, "linewidth": 2.0}, {"color": VERMILION, "linewidth": 1.6, "linestyle": (0, (4, 1.2))})
 # A family of curves: colours of falling lightness, a marker each.

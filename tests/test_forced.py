@@ -9,7 +9,15 @@ import sys
 import numpy as np
 import pytest
 
-from sd_friction_env import OrbitError, OscillatorParameters, critical_belt_speeds, kernel, limit_cycle, theory
+from sd_friction_env import (
+    OrbitError,
+    OscillatorParameters,
+    critical_belt_speeds,
+    kernel,
+    limit_cycle,
+    simulate,
+    theory,
+)
 from sd_friction_env.forced import (
     bifurcation_diagram,
     dithered_amplitude,
@@ -406,3 +414,51 @@ def test_the_interpreted_kernel_gives_the_same_bits():
     ]
     assert runs[0] == runs[1]
     assert len(bytes.fromhex(runs[0].strip())) == struct.calcsize("20d")
+
+
+ON_EVENTS = {
+    "crossing at v = 0": (
+        {"geometry": "linear", "friction": "coulomb", "mu_s": 0.3, "mu_k": 0.3, "belt_speed": 0.0},
+        {"force_amplitude": 1.0, "force_frequency": 1.3},
+        {"crossing"},
+    ),
+    "landing and breakaway": (
+        {"geometry": "linear", "friction": "coulomb", "mu_s": 0.4, "mu_k": 0.2, "belt_speed": 0.0},
+        {"force_amplitude": 0.5, "force_frequency": 0.7},
+        {"restick", "breakaway"},
+    ),
+    "the switch at x = 0": (
+        {"alpha": 0.0, "mu_s": 0.1, "beta": 0.3, "belt_speed": 1.0},
+        {"force_amplitude": 3.0, "force_frequency": 0.9},
+        {"switching", "crossing"},
+    ),
+    "a ripple": (
+        {"geometry": "linear", "friction": "coulomb", "mu_s": 0.3, "mu_k": 0.3, "belt_speed": 0.1},
+        {"ripple_amplitude": 0.5, "ripple_frequency": 1.3},
+        {"restick", "breakaway"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ON_EVENTS)
+def test_a_section_on_an_event_loses_and_doubles_no_saltation(name):
+    numbers, drive, wanted = ON_EVENTS[name]
+    p = OscillatorParameters(**numbers, **drive)
+    (rate,) = [value for key, value in drive.items() if key.endswith("frequency")]
+    (kind,) = [key.split("_")[0] for key in drive if key.endswith("frequency")]
+    orbit = forced_orbit(p, 1.5, 0.0)
+    sizes = sorted(abs(m) for m in orbit.multipliers)
+    events = simulate(p, orbit.x, orbit.v, orbit.period, dt=0.1).events
+    assert wanted == {event.kind for event in events}
+    for event in events:
+        for late in (0.0, 1e-13, -1e-13, 1e-10, -1e-10, 1e-6, -1e-6):
+            shifted = p.replace(**{f"{kind}_phase": math.remainder(rate * (event.time + late), 2.0 * math.pi)})
+            found = forced_orbit(shifted, event.x, event.v, multiple=orbit.multiple, transient=0)
+            assert sorted(abs(m) for m in found.multipliers) == pytest.approx(sizes, abs=1e-6), (event, late)
+            assert (found.sticks, found.forward_arcs) == (orbit.sticks, orbit.forward_arcs)
+            assert found.singular_events == 0
+            if late == 0.0 and sizes[0] > 1e-3:
+                exponent = lyapunov_exponent(shifted, found.x, found.v, cycles=40, transient=0)
+                assert sum(exponent.exponents) == pytest.approx(math.log(sizes[0] * sizes[1]) / orbit.period, abs=1e-6)
+    if name == "crossing at v = 0":
+        assert sizes == pytest.approx([0.58164568, 0.58164568], abs=1e-7)

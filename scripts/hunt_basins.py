@@ -1,0 +1,179 @@
+"""Compare the labels of ``basins`` with direct runs of random starts of random plants.
+
+    python scripts/hunt_basins.py                          20,000 starts, seed 0
+    python scripts/hunt_basins.py --seed 3 --starts 600
+
+A direct run follows the motion by ``kernel.advance`` alone and knows nothing of return maps: it is held against the
+extremes of x of the attractor that the label names, in stretches of growing length. It is "not settled" where its
+budget of integration steps ends before the extremes do not change any more; such starts decide nothing.
+"""
+
+import argparse
+import math
+import time
+from collections import Counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sd_friction_env import OscillatorParameters, kernel
+from sd_friction_env.basins import LOST_CONTACT, UNDECIDED, Basins, basins
+from sd_friction_env.orbits import LimitCycle, equilibria, stick_intervals
+
+STARTS_OF_A_PLANT = 12
+SAME = 1e-5  # extremes of x, relative to the motion's size
+CHANGED = 1e-3
+STILL = 1e-9
+BUDGET = 3e5  # integration steps of a direct run
+
+
+class Verdict(NamedTuple):
+    """What a direct run says of a label: "held", "wrong", "undecided" or "not settled", and why."""
+
+    what: str
+    why: str = ""
+
+
+def draw_plant(rng: np.random.Generator) -> OscillatorParameters:
+    """Return a plant from the whole accepted range; half of them from its middle."""
+    wide = rng.random() < 0.5
+
+    def spread(low: float, high: float, inner_low: float, inner_high: float) -> float:
+        ends = (low, high) if wide else (inner_low, inner_high)
+        return float(np.exp(rng.uniform(*np.log(ends))))
+
+    numbers: dict[str, Any] = {"geometry": str(rng.choice(["exact", "cubic", "linear", "duffing"]))}
+    numbers["friction"] = str(rng.choice(["stribeck", "coulomb", "hyperbolic", "exponential"]))
+    numbers["alpha"] = spread(1e-3, 10.0, 0.05, 2.0)
+    if numbers["geometry"] == "exact" and rng.random() < 0.3:
+        numbers["alpha"] = 0.0 if rng.random() < 0.7 else float(rng.uniform(1e-3, 0.05))
+    numbers["g1"] = spread(1e-3, 100.0, 0.5, 2.0)
+    numbers["beta"] = 0.0 if rng.random() < 0.15 else spread(1e-5, 10.0, 1e-2, 2.0)
+    numbers["mu_s"] = 0.0 if rng.random() < 0.02 else spread(1e-3, 10.0, 0.05, 1.0)
+    share = rng.choice([0.0, 1.0, rng.random()], p=[0.1, 0.1, 0.8])
+    numbers["mu_m"] = float(share * numbers["mu_s"])
+    numbers["mu_k"] = numbers["mu_m"]
+    numbers["v_m"] = spread(1e-2, 100.0, 0.2, 2.0)
+    numbers["belt_speed"] = spread(1e-3, 10.0, 0.02, 2.0)
+    numbers["delta"] = 0.0 if rng.random() < 0.1 else spread(1e-3, 1e3, 0.1, 10.0)
+    numbers["v_0"] = spread(1e-3, 100.0, 0.1, 2.0)
+    numbers["mu_v"] = 0.0 if rng.random() < 0.5 else spread(1e-4, 10.0, 0.01, 0.5)
+    numbers["kappa"] = 0.0 if rng.random() < 0.1 else spread(1e-4, 10.0, 0.1, 2.0)
+    return OscillatorParameters(**numbers)
+
+
+def draw_starts(rng: np.random.Generator, parameters: OscillatorParameters, count: int) -> np.ndarray:
+    """Return starts (count, 2): anywhere, in the middle, and about the equilibria."""
+    starts = rng.uniform(-10.0, 10.0, (count, 2))
+    starts[count // 4 : count // 2] *= 0.2
+    places = [e.x for e in equilibria(parameters) if abs(e.x) < 9.0] or [0.0]
+    for i in range(count // 2, count):
+        size = np.exp(rng.uniform(np.log(1e-3), 0.0))
+        starts[i] = [rng.choice(places), 0.0] + size * rng.uniform(-1.0, 1.0, 2)
+    return starts
+
+
+def stiffest(p: OscillatorParameters, x: float, v: float) -> float:
+    """Return a rate that bounds the step of an explicit integration about a state."""
+    speeds = (abs(v) + p.belt_speed, p.belt_speed, 1e-6)
+    slope = max(abs(kernel.friction_slope(p.plant, -1, -w)) for w in speeds)
+    return max(15.0, 2.0 * p.beta + max(p.normal_force(x), p.normal_force(0.5 * x), p.g1) * slope)
+
+
+def follow(p: OscillatorParameters, x: float, v: float, found: Basins, label: int) -> Verdict:
+    """Return what a direct run says of a label."""
+    plant, belt = p.plant, p.belt_speed
+    stuck = sum(high - low for low, high in stick_intervals(p)) / belt
+    slowest = min((abs(e.eigenvalues[0] * e.eigenvalues[1]) for e in equilibria(p)), default=1.0)
+    duration = max(30.0, 3.0 * stuck, min(30.0 / math.sqrt(max(slowest, 1e-12)), 1e4))
+    spent, last, near = 0.0, (math.nan, math.nan), None
+    while True:
+        low, high, left = math.inf, -math.inf, duration
+        while left > 0.0:
+            rate = stiffest(p, x, v)
+            piece = min(left, 2e4 / rate)
+            x, v, _, mode, status, t, _, _, stick_time, _, x_min, x_max = kernel.advance(
+                plant, x, v, belt, 0.0, 0.0, piece, None
+            )
+            low, high = min(low, x_min), max(high, x_max)
+            left = 0.0 if piece == left and status == kernel.OK else left - t
+            spent += rate * (t - stick_time) / 3.0 + 200.0
+            if status == kernel.CONTACT_LOST:
+                return Verdict("held" if label == LOST_CONTACT else "wrong", "contact lost")
+            if status == kernel.STEP_LIMIT or not math.isfinite(x + v):
+                return Verdict("not settled", "step limit")
+            if spent > 2.0 * BUDGET:
+                return Verdict("not settled", f"stiff: {rate:.3g}")
+        size = max(1e-2, abs(low), abs(high))
+        change = max(abs(low - last[0]), abs(high - last[1])) / size
+        last = (low, high)
+        distances = [max(abs(low - a.x_min), abs(high - a.x_max)) / size for a in found.attractors]
+        order = sorted(range(len(distances)), key=distances.__getitem__)
+        close = (
+            order[0] if order and distances[order[0]] < SAME and found.attractors[order[0]].kind != "neutral" else None
+        )
+        if close is not None and close == near:
+            return Verdict("held" if close == label else "wrong", f"reaches {close}")
+        near = close
+        if spent > BUDGET or (change < STILL and close is None):
+            here = f"{low:.9g} to {high:.9g} after {duration:.3g}, changed by {change:.2g}"
+            if change < 100.0 * SAME * 1e-3 and (
+                not order or distances[order[0]] > CHANGED or found.attractors[order[0]].kind == "neutral"
+            ):
+                neutral = label >= 0 and found.attractors[label].kind == "neutral"
+                if neutral:
+                    a = found.attractors[label]
+                    neutral = a.x_min - SAME * size <= low and high <= a.x_max + SAME * size
+                return Verdict("held" if neutral else "wrong", f"keeps {here}")
+            return Verdict("not settled", here)
+        duration *= 2.0
+
+
+def check_basins(seed: int, starts: int) -> tuple[int, int, list[dict[str, Any]]]:
+    """Return how many starts were tried, how many labels a direct run confirmed, and the others, each with its seed."""
+    held, rest = 0, []
+    for plant_number in range(-(-starts // STARTS_OF_A_PLANT)):
+        rng = np.random.default_rng([seed, plant_number])
+        p = draw_plant(rng)
+        count = min(STARTS_OF_A_PLANT, starts - plant_number * STARTS_OF_A_PLANT)
+        places = draw_starts(rng, p, STARTS_OF_A_PLANT)[:count]
+        begin = time.perf_counter()
+        found = basins(p, np.clip(places[:, 0], -10, 10), np.clip(places[:, 1], -10, 10))
+        lasted = time.perf_counter() - begin
+        if lasted > 5.0:
+            rest.append({"seed": (seed, plant_number), "verdict": "slow", "why": f"{lasted:.3g} s", "p": p})
+        for (x, v), label in zip(np.clip(places, -10, 10).tolist(), found.labels.tolist(), strict=True):
+            verdict = follow(p, x, v, found, label)
+            what = "undecided" if label == UNDECIDED else verdict.what
+            held += what == "held"
+            if what != "held":
+                rest.append(
+                    {
+                        "seed": (seed, plant_number),
+                        "verdict": what,
+                        "why": verdict.why,
+                        "p": p,
+                        "x": x,
+                        "v": v,
+                        "label": label,
+                        "attractors": [(a.kind, a.x_min, a.x_max) for a in found.attractors],
+                    }
+                )
+    return starts, held, rest
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--starts", type=int, default=20_000)
+    parser.add_argument("--show", type=int, default=40)
+    options = parser.parse_args()
+    tried, held, rest = check_basins(options.seed, options.starts)
+    counts = Counter(r["verdict"] for r in rest)
+    for r in [r for r in rest if r["verdict"] != "not settled"][: options.show]:
+        print(r)
+    print(f"{tried} starts: {held} held, {dict(counts)}")
+
+
+if __name__ == "__main__":
+    main()

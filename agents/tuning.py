@@ -44,7 +44,7 @@ from tqdm import tqdm
 from agents import evaluation, training
 from sd_friction_env.callbacks import AnnealedExploration
 from sd_friction_env.policies import Policy
-from sd_friction_env.tables import atomic_file
+from sd_friction_env.storage import atomic_file
 from sd_friction_env.wrappers import ScaledReward
 
 FORMAT = 1  # of what a study says of itself

@@ -38,7 +38,7 @@ import numpy as np
 
 import sd_friction_env
 from sd_friction_env import OscillatorParameters, kernel, limit_cycle
-from sd_friction_env.tables import atomic_file
+from sd_friction_env.storage import atomic_file
 
 ROOT = Path(__file__).resolve().parent.parent
 FORCE, BELT = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0"

@@ -289,7 +289,7 @@ def test_whatever_reading_a_value_function_trips_over_names_the_file(monkeypatch
     def trip(*arguments, **more):
         raise error("tripped")
 
-    monkeypatch.setattr(np.lib.npyio.NpzFile, "__getitem__", trip)
+    monkeypatch.setattr(zipfile.ZipFile, "open", trip)
     with pytest.raises(PolicyFileError, match=rf"belt-value\.npz.*{error.__name__}: tripped.*--task belt --policy`"):
         OptimalPolicy.load(TASKS["belt"])
     with pytest.raises(optimal.DamagedStudyError, match=rf"belt\.npz.*{error.__name__}: tripped"):
@@ -333,7 +333,7 @@ def test_a_value_function_that_cannot_be_is_refused_by_name(tmp_path, unchanging
 def test_a_table_of_optima_that_cannot_be_is_refused_by_name(tmp_path, change):
     content = json.loads((optimal.OPTIMUM_DIRECTORY / "force.json").read_text(encoding="utf-8"))
     change(content)
-    (tmp_path / "force.json").write_text(json.dumps(content), encoding="utf-8")
+    write_json(tmp_path / "force.json", content)
     with pytest.raises(optimal.DamagedStudyError, match=r"force\.json.* or is damaged .*--task force`"):
         optimal.optimal_returns(TASKS["force"], [1_000_000], directory=tmp_path)
 
@@ -353,7 +353,7 @@ def test_a_table_of_optima_that_cannot_be_is_refused_by_name(tmp_path, change):
 def test_a_fingerprint_that_lacks_something_is_that_of_another_environment(tmp_path, change):
     content = json.loads((optimal.OPTIMUM_DIRECTORY / "force.json").read_text(encoding="utf-8"))
     change(content)
-    (tmp_path / "force.json").write_text(json.dumps(content), encoding="utf-8")
+    write_json(tmp_path / "force.json", content)
     with pytest.raises(RuntimeError, match="was computed for another environment"):
         optimal.optimal_returns(TASKS["force"], [1_000_000], directory=tmp_path)
 

@@ -167,6 +167,16 @@ def naming(path: PathLike) -> Iterator[None]:
         raise StoredFileError(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}") from None
 
 
+def is_sealed(path: PathLike) -> bool:
+    """Return whether a JSON file or an archive has a seal, right or wrong.
+
+    Raises:
+        OSError, StoredFileError: as :func:`open_regular`.
+    """
+    end = read_bytes(path)[-200:]
+    return end[-_COMMENT_LENGTH:].startswith(_COMMENT) or bool(_SEALED_TEXT.search(end.decode("utf-8", "replace")))
+
+
 # JSON -----------------------------------------------------------------------------------------------------------------
 
 

@@ -744,7 +744,7 @@ def save_optimum(
         "seeds": [int(seed) for seed in seeds],
         "returns": returns.tolist(),
         "fingerprint": fingerprint(problem.env_id, seeds),
-        "sequences": file_digest(sequences),
+        "sequences": f"sha256:{file_digest(sequences)}",
     }
     write_json(table, content, indent=None, keep=True)  # one number list per line: small, and a change shows as one
     return returns
@@ -855,7 +855,8 @@ def optimal_actions(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> tuple[l
     if not path.exists():
         raise FileNotFoundError(f"there is no file of actions {str(path)!r}")
     try:
-        if stored.get("sequences", digest := file_digest(path)) != digest:
+        digest = f"sha256:{file_digest(path)}"
+        if stored.get("sequences", digest) != digest:
             raise ValueError("it is not the file that was stored with the table of returns")
         levels = load_arrays(path, "i")["levels"]
         if levels.ndim != 2 or len(levels) != len(stored["seeds"]) or levels.dtype != np.int16:

@@ -100,23 +100,24 @@ def check_free(folder: Path, *, force: bool = False) -> None:
     for place, what in ((folder, "exists"), (partial_folder(folder), "is there from an unfinished run")):
         if not place.exists() and not place.is_symlink():
             continue
-        if not _is_replaceable(place):
-            raise RunFolderError(f"{str(place)!r} exists and is no run folder: choose another --run-folder")
+        reason = _reason_to_keep(place)
+        if reason:
+            raise RunFolderError(f"{str(place)!r} exists and is no run folder ({reason}): choose another --run-folder")
         if not force:
             raise RunFolderError(f"{str(place)!r} {what}: choose another --run-folder, or replace it with --force")
 
 
-def _is_replaceable(place: Path) -> bool:
-    """Tell whether removing ``place`` removes a run (or nothing at all) and not something precious."""
+def _reason_to_keep(place: Path) -> str:
+    """Return why removing ``place`` might remove something precious; "" if it is a run or empty."""
     if place.is_symlink() or not place.is_dir():
-        return False
+        return "it is a file or a link"
     if not any(place.iterdir()):
-        return True
+        return ""
     try:
         config = read_json(place / CONFIG)
-    except (OSError, StoredFileError):
-        return False
-    return isinstance(config, dict) and config.get("kind") == KIND
+    except (OSError, StoredFileError) as error:
+        return str(error)
+    return "" if isinstance(config, dict) and config.get("kind") == KIND else f"its {CONFIG} is of something else"
 
 
 @contextlib.contextmanager
@@ -196,7 +197,7 @@ def finish(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> N
     content = {"kind": KIND, "format": FORMAT, "status": "finished", **config, "files": files}
     write_json(partial / CONFIG, content)
     if folder.exists():
-        if not force or not _is_replaceable(folder):
+        if not force or _reason_to_keep(folder):
             raise RunFolderError(f"{str(folder)!r} exists by now: the finished run is left in {str(partial)!r}")
         old = folder.with_name(folder.name + ".old" + PARTIAL)
         if old.exists():
@@ -430,7 +431,7 @@ def load_tensors(path: Path, *, sealed: bool = False) -> dict[str, Any]:
                 warnings.simplefilter("error")  # torch only warns of pickles that it did not write
                 content = torch.load(file, map_location="cpu", weights_only=True)
     except (OSError, StoredFileError) as error:
-        raise RunFolderError(f"not a table of tensors, or damaged: {error}") from None
+        raise RunFolderError(f"{error}: it is not a table of tensors, or is damaged") from None
     if not isinstance(content, dict):
         raise RunFolderError(f"{str(path)!r} is not a table of tensors: refused")
     return content

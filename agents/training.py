@@ -1207,11 +1207,13 @@ def _last_whole_checkpoint(paths: Sequence[Path]) -> tuple[Path, dict[str, Any]]
         try:
             saved = runs.load_tensors(path, sealed=True)
         except runs.RunFolderError as error:
-            damaged.append(_one_line(error)[:300])
+            damaged.append(_one_line(error))
             continue
         if damaged:
             reasons = "; ".join(damaged)
-            warnings.warn(f"a checkpoint cannot be used ({reasons}): resumed from {str(path)!r} instead", stacklevel=4)
+            warnings.warn(
+                f"a checkpoint is damaged ({reasons}): resumed from its predecessor {str(path)!r}", stacklevel=4
+            )
         return path, saved
     if damaged:
         raise runs.RunFolderError(

@@ -62,7 +62,7 @@ def seal(path: Path) -> bool:
     indent = next((width for width in (1, 2, None) if json_text(content, width) == text), 2)
     sequences = path.with_suffix(".npz")
     if "seeds" in content and sequences.is_file():
-        content["sequences"] = file_digest(sequences)
+        content["sequences"] = f"sha256:{file_digest(sequences)}"
     write_json(path, content, indent=indent)
     return True
 

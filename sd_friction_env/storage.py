@@ -35,18 +35,20 @@ LARGEST_ARCHIVE = 2**30  # bytes
 LARGEST_INFLATED = 2**25  # bytes of an archive's compressed entries in all; larger arrays are not compressed
 LARGEST_JSON = 2**22
 LARGEST_YAML = 2**16  # PyYAML reads some hundred kilobytes a second
-DEEPEST_YAML = 32
+MOST_YAML_VALUES = 20_000
 MOST_DIGITS = 40  # of a whole number
 PREVIOUS = ".previous"
 
-_MOST_ENTRIES = 10_000
+_LARGEST_DIRECTORY = 2**20  # bytes: some ten thousand entries
 _SEAL_KEY = "sha256"
 _SEALED_TEXT = re.compile(r'"[0-9a-f]{64}"\s*\}\s*\Z')
 _COMMENT = b"sha256:"
 _COMMENT_LENGTH = len(_COMMENT) + 64
-# The record that ends a zip file: signature, disks, numbers of entries, directory, length of the comment.
-_END = struct.Struct("<4s4H2LH")
-_END_SIGNATURE, _ZIP64_LOCATOR, _ZIP64_LOCATOR_SIZE = b"PK\x05\x06", b"PK\x06\x07", 20
+# The records that end a zip file. The last one: signature, disks, numbers of entries, size and place of the directory,
+# length of the comment. Before it, in the form for large files (which PyTorch writes always): signature, sizes,
+# versions, disks, numbers of entries, size and place of the directory; and a locator.
+_END, _END_SIGNATURE = struct.Struct("<4s4H2LH"), b"PK\x05\x06"
+_END_64, _END_64_SIGNATURE, _LOCATOR_SIGNATURE = struct.Struct("<4sQ2H2L4Q4s16x"), b"PK\x06\x06", b"PK\x06\x07"
 _POLL = 0.02  # seconds between two attempts to take a lock
 
 
@@ -249,9 +251,13 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _whole(digits: str) -> int:
+    _check_digits(digits)
+    return int(digits)
+
+
+def _check_digits(digits: str) -> None:
     if len(digits) > MOST_DIGITS:
         raise StoredFileError(f"a whole number of {len(digits)} digits; at most {MOST_DIGITS} are read")
-    return int(digits)
 
 
 # YAML -----------------------------------------------------------------------------------------------------------------
@@ -260,51 +266,55 @@ def _whole(digits: str) -> int:
 def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text of plain data.
 
-    Anchors and aliases are refused: a few lines of them can stand for gigabytes.
+    A few lines of aliases can stand for gigabytes: the values that a text stands for are counted before any is made.
 
     Raises:
-        StoredFileError: if it is no such text, too long or too deep, or a key is given twice.
+        StoredFileError: if it is no such text, stands for too many values, or a key is given twice.
     """
     import yaml
 
     if len(text) > LARGEST_YAML:
         raise StoredFileError(f"too long a text: {len(text):,} characters; at most {LARGEST_YAML:,} are read")
-
-    class Loader(yaml.SafeLoader):
-        depth = 0
-
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            event: Any = self.peek_event()  # type: ignore[no-untyped-call]
-            if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
-                raise StoredFileError(f"anchors and aliases are not allowed, got {event.anchor[:100]!r}")
-            self.depth += 1
-            if self.depth > DEEPEST_YAML:
-                raise StoredFileError(f"more than {DEEPEST_YAML} values lie in one another")
-            node = super().compose_node(parent, index)
-            self.depth -= 1
-            return node
-
-        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-            found = super().construct_mapping(node, deep)
-            if len(found) < len(node.value):
-                raise StoredFileError(f"a key is given twice{node.start_mark}")
-            return found
-
-        def construct_yaml_int(self, node: Any) -> int:
-            if len(node.value) > MOST_DIGITS:
-                raise StoredFileError(f"a whole number of {len(node.value)} digits; at most {MOST_DIGITS} are read")
-            return int(super().construct_yaml_int(node))
-
-    Loader.add_constructor("tag:yaml.org,2002:int", Loader.construct_yaml_int)
-    loader = Loader(text)
+    loader = yaml.SafeLoader(text)
     try:
-        return loader.get_single_data()
+        root = loader.get_single_node()
+        if root is None:
+            return None
+        _count_values(root, {})
+        return loader.construct_document(root)
     except StoredFileError:
         raise
     except (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError, RecursionError) as error:
         raise StoredFileError(f"not YAML: {' '.join(str(error).split())}") from None
     finally:
         loader.dispose()
+
+
+def _count_values(node: Any, counts: dict[int, int]) -> int:
+    """Return how many values a node of YAML stands for, aliases included; raise if they are too many or cannot be.
+
+    Args:
+        counts: of the nodes seen so far, by identity; 0 while one is being counted.
+    """
+    if id(node) in counts:
+        if not counts[id(node)]:
+            raise StoredFileError("an alias of what it lies in")
+        return counts[id(node)]
+    counts[id(node)] = 0
+    children = node.value if isinstance(node.value, list) else []
+    if children and isinstance(children[0], tuple):
+        keys = [key.value for key, _ in children if isinstance(key.value, str) and key.value != "<<"]
+        if len(set(keys)) < len(keys):
+            twice = next(key for i, key in enumerate(keys) if key in keys[:i])
+            raise StoredFileError(f"the key {twice[:100]!r} is given twice")
+        children = [part for pair in children for part in pair]
+    elif node.tag == "tag:yaml.org,2002:int":
+        _check_digits(node.value)
+    count = 1 + sum(_count_values(child, counts) for child in children)
+    if count > MOST_YAML_VALUES:
+        raise StoredFileError(f"its aliases make it more than {MOST_YAML_VALUES:,} values")
+    counts[id(node)] = count
+    return count
 
 
 def read_yaml(path: PathLike) -> Any:
@@ -348,7 +358,7 @@ def open_archive(file: BinaryIO, *, sealed: bool = False, compressed: bool = Tru
         StoredFileError: if it differs from its seal, or is no archive that would be written here.
     """
     size = file.seek(0, os.SEEK_END)
-    file.seek(-min(size, _ZIP64_LOCATOR_SIZE + _END.size + _COMMENT_LENGTH), os.SEEK_END)
+    file.seek(-min(size, _END_64.size + _END.size + _COMMENT_LENGTH), os.SEEK_END)
     tail = file.read()
     has_seal = tail[-_COMMENT_LENGTH:].startswith(_COMMENT)
     if has_seal:
@@ -359,12 +369,16 @@ def open_archive(file: BinaryIO, *, sealed: bool = False, compressed: bool = Tru
     end = tail[-_END.size :]
     if len(end) < _END.size:
         raise StoredFileError("not an archive: it is too short")
-    signature, *_, entries, _, _, comment = _END.unpack(end)
+    signature, *_, directory, _, comment = _END.unpack(end)
     if signature != _END_SIGNATURE or comment != has_seal * _COMMENT_LENGTH:
         raise StoredFileError("not an archive, cut short or damaged: its last record is missing")
-    large = tail[-_END.size - _ZIP64_LOCATOR_SIZE :].startswith(_ZIP64_LOCATOR)
-    if entries > _MOST_ENTRIES or (large and size < 2**32):
-        raise StoredFileError(f"an archive of too many entries: at most {_MOST_ENTRIES:,} are read")
+    before = tail[: -_END.size]
+    if before[-20:].startswith(_LOCATOR_SIGNATURE):
+        if not before.startswith(_END_64_SIGNATURE):
+            raise StoredFileError("not an archive that would be written here: its directory is elsewhere")
+        directory = _END_64.unpack(before)[-3]
+    if directory > _LARGEST_DIRECTORY:
+        raise StoredFileError(f"an archive whose directory has {directory:,} bytes; at most {_LARGEST_DIRECTORY:,}")
     file.seek(0)
     with zipfile.ZipFile(file) as archive:
         found = archive.infolist()

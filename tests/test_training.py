@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from agents import evaluation, runs, training
 from scripts import evaluate as evaluate_script
 from scripts import train as train_script
-from sd_friction_env import ENVIRONMENT_IDS, Table
+from sd_friction_env import ENVIRONMENT_IDS, Table, storage
 from sd_friction_env.policies import load_policy
 from sd_friction_env.wrappers import ScaledReward
 
@@ -222,7 +222,7 @@ def test_a_run_that_was_stopped_is_never_taken_for_a_finished_one(tmp_path):
 
 def damage_config(folder, **changes):
     config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**config, **changes}))
+    storage.write_json(folder / "config.json", {**config, **changes})
 
 
 def test_damaged_folders_are_refused(copied, tmp_path):
@@ -253,11 +253,11 @@ def test_damaged_folders_are_refused(copied, tmp_path):
 def test_weights_that_do_not_fit_are_refused(copied):
     config = json.loads((copied / "config.json").read_text())
     config["hyperparameters"]["policy_kwargs"]["net_arch"] = [32]
-    (copied / "config.json").write_text(json.dumps(config))
+    storage.write_json(copied / "config.json", config)
     with pytest.raises(runs.RunFolderError, match="does not fit"):
         runs.load_torch_policy(copied)
     config["hyperparameters"]["policy_kwargs"]["activation_fn"] = "os.system"
-    (copied / "config.json").write_text(json.dumps(config))
+    storage.write_json(copied / "config.json", config)
     with pytest.raises(runs.RunFolderError, match="activation_fn must be one of Tanh, ReLU"):
         runs.load_torch_policy(copied)
 
@@ -314,7 +314,7 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
     assert process.returncode == 130
     assert "interrupted" in errors
     assert "Traceback" not in errors
-    (last,) = checkpoints.glob("step_*.pt")
+    last = max(checkpoints.glob("step_*.pt"))
     assert str(last) in errors
     assert f"--run-folder {tmp_path / 'run'} --resume" in errors
     parameters = runs.load_tensors(last)["parameters"]

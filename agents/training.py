@@ -1210,10 +1210,8 @@ def _last_whole_checkpoint(paths: Sequence[Path]) -> tuple[Path, dict[str, Any]]
             damaged.append(_one_line(error))
             continue
         if damaged:
-            reasons = "; ".join(damaged)
-            warnings.warn(
-                f"a checkpoint is damaged ({reasons}): resumed from its predecessor {str(path)!r}", stacklevel=4
-            )
+            said = f"a checkpoint is damaged ({'; '.join(damaged)}): resumed from its predecessor {str(path)!r}"
+            warnings.warn(said, stacklevel=4)
         return path, saved
     if damaged:
         raise runs.RunFolderError(

@@ -208,7 +208,7 @@ folder = base / "run"
 if mode == "chain":  # the same run is killed again and again, a little later every time
     last, kills = 5, 0
     while attempt(folder, last, runs.partial_folder(folder).is_dir()) == -signal.SIGKILL and last < 200:
-        last, kills = last + 6, kills + 1
+        last, kills = last + 4, kills + 1
     print(kills)
 else:  # a run is killed once, at every place there is
     expected = None

@@ -505,11 +505,10 @@ def _check_trials(study: optuna.Study) -> None:
     digest."""
     for trial in study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]):
         digest, best = trial.user_attrs.get(_DIGEST), trial.user_attrs.get("best")
-        is_whole = isinstance(best, dict) and trial.value == best.get("credited_return")
-        if not is_whole or digest not in (None, _trial_digest(trial, best)):
-            raise StudyError(
-                f"trial {trial.number} of study {study.study_name!r} is damaged, or changed since it ended"
-            )
+        found = best if isinstance(best, dict) else {}
+        if trial.value != found.get("credited_return") or digest not in (None, _trial_digest(trial, found)):
+            name = f"trial {trial.number} of study {study.study_name!r}"
+            raise StudyError(f"{name} is damaged, or changed since it ended")
 
 
 def finished_trials(study: optuna.Study) -> list[FrozenTrial]:

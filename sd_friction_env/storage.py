@@ -12,6 +12,7 @@ import contextlib
 import datetime
 import hashlib
 import io
+import itertools
 import json
 import math
 import os
@@ -35,7 +36,7 @@ LARGEST_ARCHIVE = 2**30  # bytes
 LARGEST_INFLATED = 2**25  # bytes of an archive's compressed entries in all; larger arrays are not compressed
 LARGEST_JSON = 2**22
 LARGEST_YAML = 2**16  # PyYAML reads some hundred kilobytes a second
-MOST_YAML_VALUES = 20_000
+DEEPEST_YAML, MOST_YAML_VALUES = 100, 20_000
 MOST_DIGITS = 40  # of a whole number
 PREVIOUS = ".previous"
 
@@ -127,9 +128,10 @@ def read_bytes(path: PathLike, most: int = LARGEST_ARCHIVE) -> bytes:
         OSError, StoredFileError: as :func:`open_regular`.
     """
     with open_regular(path, most) as file:
-        data = file.read(most + 1)  # some files (in /proc) are larger than they say
-    if len(data) > most:
-        raise StoredFileError(f"{os.fspath(path)!r} is too large: at most {most:,} bytes are read")
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(size + 1)
+    if len(data) != size:  # so are some files in /proc
+        raise StoredFileError(f"{os.fspath(path)!r} is not as large as it says: another process is writing to it")
     return data
 
 
@@ -275,6 +277,9 @@ def parse_yaml(text: str) -> Any:
 
     if len(text) > LARGEST_YAML:
         raise StoredFileError(f"too long a text: {len(text):,} characters; at most {LARGEST_YAML:,} are read")
+    depth = max(itertools.accumulate((mark in "[{") - (mark in "]}") for mark in text), default=0)
+    if depth > DEEPEST_YAML:  # PyYAML's time goes with the square of that
+        raise StoredFileError(f"{depth:,} brackets lie in one another; at most {DEEPEST_YAML} are read")
     loader = yaml.SafeLoader(text)
     try:
         root = loader.get_single_node()

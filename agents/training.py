@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import inspect
+import itertools
 import json
 import math
 import numbers
@@ -60,7 +61,7 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 }
 ACTIVATIONS: dict[str, type[nn.Module]] = {"Tanh": nn.Tanh, "ReLU": nn.ReLU}
 
-LARGEST_SEED = 2**32 - 1
+LARGEST_SEED, MOST_WEIGHTS = 2**32 - 1, 2**25
 _WRAPPER = "sd_friction_env.wrappers.ScaledReward"
 _CALLBACK = "sd_friction_env.callbacks.AnnealedExploration"
 _CHECKPOINT_FORMAT = 2
@@ -182,7 +183,10 @@ def read_hyperparameters(algorithm: str, env_id: str, path: Path | None = None) 
     if not isinstance(content, dict) or not isinstance(content.get(env_id), dict):
         known = ", ".join(map(str, content)) if isinstance(content, dict) else "nothing"
         raise ValueError(f"{str(file)!r} has no hyperparameters for {env_id!r}; it has: {known}")
-    return check_hyperparameters(algorithm, content[env_id])
+    try:
+        return check_hyperparameters(algorithm, content[env_id])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{str(file)!r} has hyperparameters for {env_id} that cannot be used: {error}") from None
 
 
 def check_hyperparameters(algorithm: str, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -287,9 +291,9 @@ def parse_policy_kwargs(value: Any) -> dict[str, Any]:
         try:
             value = _literal(ast.parse(value.strip(), mode="eval").body)
         except (SyntaxError, RecursionError, MemoryError):
-            raise ValueError(f"policy_kwargs is not an expression: {value!r}") from None
+            raise ValueError(f"policy_kwargs is not an expression: {_shown(value)}") from None
     if not isinstance(value, Mapping):
-        raise ValueError(f"policy_kwargs must be dict(...), got {value!r}")
+        raise ValueError(f"policy_kwargs must be dict(...), got {_shown(value)}")
     checked: dict[str, Any] = {}
     for name, part in value.items():
         if name == "activation_fn":
@@ -314,8 +318,12 @@ def _checked_net_arch(value: Any) -> Any:
             raise ValueError(f"net_arch must have parts pi, vf or qf, got {value!r}")
         return {name: _checked_net_arch(part) for name, part in value.items()}
     if not isinstance(value, list) or len(value) > 32:
-        raise ValueError(f"net_arch must be a list of layer widths, got {value!r}")
-    return [_WIDTH.check("a width in net_arch", width) for width in value]
+        raise ValueError(f"net_arch must be a list of at most 32 layer widths, got {_shown(value)}")
+    widths = [int(_WIDTH.check("a width in net_arch", width)) for width in value]
+    weights = sum(before * after for before, after in itertools.pairwise(widths))
+    if weights > MOST_WEIGHTS:  # what is trained must be read again, and files are bounded
+        raise ValueError(f"net_arch must have at most {MOST_WEIGHTS:,} weights between its layers, got {weights:,}")
+    return widths
 
 
 def _literal(node: ast.expr) -> Any:
@@ -331,7 +339,7 @@ def _literal(node: ast.expr) -> Any:
         return ast.literal_eval(node)
     except (ValueError, TypeError):
         raise ValueError(
-            f"policy_kwargs may hold literals and nn.{', nn.'.join(ACTIVATIONS)}; got {ast.unparse(node)!r}"
+            f"policy_kwargs may hold literals and nn.{', nn.'.join(ACTIVATIONS)}; got {_shown(ast.unparse(node))}"
         ) from None
 
 

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.orbits import equilibria
 from sd_friction_env.parameters import checked_number
-from sd_friction_env.storage import StoredFileError, load_arrays, parse_json, save_arrays
+from sd_friction_env.storage import StoredFileError, load_arrays, naming, parse_json, save_arrays
 
 Actions = NDArray[np.float32]
 State = tuple[NDArray[Any], ...] | None
@@ -587,7 +587,8 @@ def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
         raise PolicyFileError(f"{name!r} is a folder; name the policy.npz in it")
     try:
         arrays = load_arrays(path, kinds="f", texts=("header",))
-        header = parse_json(str(arrays.pop("header")))
+        with naming(path):
+            header = parse_json(str(arrays.pop("header")))
         if not isinstance(header, dict) or header.get("kind") != _NETWORK_KIND:
             raise PolicyFileError(f"{name!r} is not a policy of sd_friction_env")
         if header["format"] != NETWORK_FORMAT:

@@ -34,7 +34,7 @@ PathLike = str | os.PathLike[str]
 
 LARGEST_ARCHIVE = 2**30  # bytes
 LARGEST_INFLATED = 2**25  # bytes of an archive's compressed entries in all; larger arrays are not compressed
-LARGEST_JSON = 2**22
+LARGEST_JSON = 2**20
 LARGEST_YAML = 2**16  # PyYAML reads some hundred kilobytes a second
 DEEPEST_YAML, MOST_YAML_VALUES = 100, 20_000
 MOST_DIGITS = 40  # of a whole number
@@ -151,7 +151,7 @@ def file_digest(path: PathLike) -> str:
     Raises:
         OSError, StoredFileError: as :func:`open_regular`.
     """
-    with open_regular(path, sys.maxsize) as file:
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -204,10 +204,13 @@ def write_json(path: PathLike, content: Mapping[str, Any], *, indent: int | None
         indent: see :func:`json_text`. keep: see :func:`atomic_file`.
 
     Raises:
-        OSError: if it cannot be written. ValueError: if a number is not finite.
+        OSError: if it cannot be written.
+        ValueError: if a number is not finite, or it would be too large to be read again.
     """
     unsealed = {name: value for name, value in content.items() if name != _SEAL_KEY}
     text = json_text({**unsealed, _SEAL_KEY: content_digest(unsealed)}, indent)
+    if len(text) > LARGEST_JSON:
+        raise ValueError(f"{os.fspath(path)!r} would have {len(text):,} characters; at most {LARGEST_JSON:,} are read")
     with atomic_file(path, keep=keep) as file:
         file.write(text)
 

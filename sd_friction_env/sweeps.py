@@ -57,6 +57,7 @@ _WATCH = 0.5  # seconds between two looks at whether the parent lives
 _PATIENCE = 3  # times that workers may be lost in a row with no chunk finished between
 _EXTRAS = {"loky": "sweep", "dask": "dask", "ray": "ray"}
 _MANIFEST, _LOCK = "sweep.json", ".sweep.lock"
+_LARGEST_MANIFEST = 2**27  # bytes
 _BELONGS = "belongs to"  # name of the text in a chunk's file that says to which sweep, and where in it
 _COLUMN_KINDS = "biufcU"
 
@@ -319,7 +320,7 @@ class _Store:
         assert self.folder is not None
         manifest, name = self.folder / _MANIFEST, str(self.folder)
         try:
-            text = read_bytes(manifest).decode("utf-8")
+            text = read_bytes(manifest, _LARGEST_MANIFEST).decode("utf-8")
             if text == self._manifest():
                 return True
             stored = parse_json(text)

@@ -7,13 +7,9 @@ suppressed episodes is kept beside it.
 
 import contextlib
 import dataclasses
-import errno
 import functools
-import json
 import math
-import os
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -38,7 +34,7 @@ from sd_friction_env.policies import (
     State,
     VelocityFeedback,
 )
-from sd_friction_env.tables import atomic_file
+from sd_friction_env.storage import locked, predecessor_hint, read_json, write_json
 
 GAINS_FILE = Path(__file__).parent / "classical.json"
 TUNING_SEEDS = evaluation.VALIDATION_SEEDS[:32]
@@ -398,61 +394,27 @@ def stored_gains(path: Path | None = None) -> dict[str, dict[str, Any]]:
     if not path.exists():
         return {}
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        gains: dict[str, dict[str, Any]] = content["gains"]
+        gains: dict[str, dict[str, Any]] = read_json(path)["gains"]
         for env_id, controllers in gains.items():
             for name, found in controllers.items():
                 if env_id not in ENVIRONMENT_IDS or name not in KINDS:
                     raise ValueError(f"{env_id}: {name}")
                 if set(found["values"]) != set(KINDS[name].ranges(_nominal_env(env_id))):
                     raise ValueError(f"{env_id}: {name}: {sorted(found['values'])}")
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{str(path)!r} does not hold gains of classical controllers ({error})") from None
+                _with(name, env_id, found["values"])
+    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{str(path)!r} does not hold gains of classical controllers ({error}){predecessor_hint(path)}"
+        ) from None
     return gains
-
-
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Keep other processes (and threads) out until done; the system lets go if this process dies."""
-    lock = path.with_name(f".{path.name}.lock")
-    if sys.platform == "win32":
-        import msvcrt
-
-        with open(lock, "ab") as file:
-            while True:
-                file.seek(0)
-                try:
-                    msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)
-                    break
-                except OSError as error:
-                    if error.errno != errno.EDEADLK:  # that is: not yet, in ten tries
-                        raise
-            yield
-        with contextlib.suppress(OSError):  # another one waits for it
-            lock.unlink()
-    else:
-        import fcntl
-
-        while True:
-            with open(lock, "ab") as file:
-                fcntl.flock(file, fcntl.LOCK_EX)
-                try:  # who had it before has deleted it, and another process may hold a new one
-                    if not os.path.samestat(os.fstat(file.fileno()), lock.stat()):
-                        continue
-                except FileNotFoundError:
-                    continue
-                try:
-                    yield
-                finally:
-                    lock.unlink()
-                return
 
 
 def keep(env_id: str, name: str, found: Mapping[str, Any], path: Path | None = None) -> dict[str, Any]:
     """Store what :func:`tune` found unless what is stored does better in the environment as it is now; return what is
     stored then.
 
-    Whatever else is stored stays as it is, whoever stores at the same time; the file is written whole or not at all.
+    Whatever else is stored stays as it is, whoever stores at the same time; the file is written whole or not at all,
+    and its predecessor is kept as "NAME.previous".
 
     Args:
         env_id, name: of the environment and the controller. found: of :func:`tune`, with the command.
@@ -462,7 +424,7 @@ def keep(env_id: str, name: str, found: Mapping[str, Any], path: Path | None = N
         ValueError: if the file is not one of ours. OSError: if it cannot be written.
     """
     path = GAINS_FILE if path is None else path
-    with _locked(path):
+    with locked(path.with_name(f".{path.name}.lock"), repr(str(path)), wait=True):
         gains = stored_gains(path)
         before = gains.get(env_id, {}).get(name)
         kept = dict(found)
@@ -472,9 +434,7 @@ def keep(env_id: str, name: str, found: Mapping[str, Any], path: Path | None = N
             if again["validation_return"] > found["validation_return"]:
                 kept = {**before, **again, "at_bound": at_bound(name, env_id, before["values"])}
         gains.setdefault(env_id, {})[name] = kept
-        with atomic_file(path) as file:
-            json.dump({"gains": gains}, file, indent=1)
-            file.write("\n")
+        write_json(path, {"gains": gains}, indent=1, keep=True)
     return kept
 
 

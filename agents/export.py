@@ -21,7 +21,7 @@ import sd_friction_env
 from agents import evaluation
 from sd_friction_env import SDFrictionEnv
 from sd_friction_env.policies import NetworkPolicy
-from sd_friction_env.tables import atomic_file
+from sd_friction_env.storage import atomic_file
 
 OPSET = 17
 TOLERANCE = 1e-6

@@ -35,9 +35,17 @@ import sd_friction_env
 from sd_friction_env import kernel
 from sd_friction_env.env import ACTUATOR_CODES, SDFrictionEnv
 from sd_friction_env.parameters import OscillatorParameters
-from sd_friction_env.policies import PolicyFileError, Readings, State, read_arrays
+from sd_friction_env.policies import PolicyFileError, Readings, State
 from sd_friction_env.pretrained import close
-from sd_friction_env.tables import atomic_file
+from sd_friction_env.storage import (
+    file_digest,
+    load_arrays,
+    parse_json,
+    predecessor_hint,
+    read_json,
+    save_arrays,
+    write_json,
+)
 from sd_friction_env.task import Task, passive_motion
 
 Array = NDArray[np.float64]
@@ -719,6 +727,8 @@ def save_optimum(
 ) -> Array:
     """Store sequences, the returns of what is stored, and the fingerprint. Return those returns, shape (n,).
 
+    Files that are there are kept as their predecessors, "NAME.previous".
+
     Args:
         actions: shape (n, steps). about: JSON values that say how they were found.
     """
@@ -726,8 +736,7 @@ def save_optimum(
     returns = problem.returns(decode(levels).astype(np.float64))
     table, sequences = _paths(problem.env_id, directory)
     directory.mkdir(parents=True, exist_ok=True)
-    with atomic_file(sequences, "wb") as file:
-        np.savez_compressed(file, levels=levels)
+    save_arrays(sequences, {"levels": levels}, compress=True, keep=True)
     content = {
         "env_id": problem.env_id,
         "mean_return": float(returns.mean()),
@@ -735,11 +744,9 @@ def save_optimum(
         "seeds": [int(seed) for seed in seeds],
         "returns": returns.tolist(),
         "fingerprint": fingerprint(problem.env_id, seeds),
+        "sequences": f"sha256:{file_digest(sequences)}",
     }
-    # One number list per line: small, and a change shows as one.
-    lines = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in content.items()]
-    with atomic_file(table) as file:
-        file.write("{\n" + ",\n".join(lines) + "\n}\n")
+    write_json(table, content, indent=None, keep=True)  # one number list per line: small, and a change shows as one
     return returns
 
 
@@ -757,7 +764,7 @@ def stored_study(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[str, 
         raise FileNotFoundError(f"no optimum is stored for {env_id!r}; stored: {', '.join(there) or 'none'}")
     path = _paths(env_id, directory)[0]
     try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        content: dict[str, Any] = read_json(path)
         of, seeds, returns = content["env_id"], content["seeds"], np.array(content["returns"], dtype=float)
         if _FILES.get(of) != _FILES[env_id]:
             raise ValueError(f"it is of {of!r}")
@@ -767,15 +774,15 @@ def stored_study(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[str, 
             raise ValueError("a return is not finite")
         if not isinstance(content["fingerprint"], dict):
             raise ValueError("its fingerprint is none")
-    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise DamagedStudyError(_damaged(path, env_id, error)) from None
     return content
 
 
 def _damaged(path: Path, env_id: str, error: Exception) -> str:
     return (
-        f"{str(path)!r} does not hold the optimum of {env_id}, or is damaged ({type(error).__name__}: {error}): "
-        f"recompute it with `{_command(env_id)}`"
+        f"{str(path)!r} does not hold the optimum of {env_id}, or is damaged ({type(error).__name__}: {error})"
+        f"{predecessor_hint(path)}: recompute it with `{_command(env_id)}`"
     )
 
 
@@ -848,10 +855,13 @@ def optimal_actions(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> tuple[l
     if not path.exists():
         raise FileNotFoundError(f"there is no file of actions {str(path)!r}")
     try:
-        (levels,) = read_arrays(path, "levels")
+        digest = f"sha256:{file_digest(path)}"
+        if stored.get("sequences", digest) != digest:
+            raise ValueError("it is not the file that was stored with the table of returns")
+        levels = load_arrays(path, "i")["levels"]
         if levels.ndim != 2 or len(levels) != len(stored["seeds"]) or levels.dtype != np.int16:
             raise ValueError(f"levels {levels.dtype} {levels.shape} are not those of {len(stored['seeds'])} seeds")
-    except Exception as error:  # see read_arrays
+    except (OSError, KeyError, ValueError) as error:
         raise DamagedStudyError(_damaged(path, _bare_id(env_id), error)) from None
     return stored["seeds"], decode(levels)
 
@@ -904,8 +914,9 @@ class OptimalPolicy:
             raise FileNotFoundError(f"no value function is stored for {env_id!r}; allowed: {', '.join(TASKS.values())}")
         env = _make(env_id)
         try:
-            text, lows, highs, values = read_arrays(path, "fingerprint", "lows", "highs", "values")
-            stored = json.loads(str(text))
+            arrays = load_arrays(path, "f", texts=("fingerprint",))
+            lows, highs, values = arrays["lows"], arrays["highs"], arrays["values"]
+            stored = parse_json(str(arrays["fingerprint"]))
             if not isinstance(stored, dict):
                 raise ValueError("its fingerprint is none")
             dimensions = 2 + (env.task.actuator == "belt_speed")
@@ -915,10 +926,10 @@ class OptimalPolicy:
                 raise ValueError(f"bounds {lows.tolist()} to {highs.tolist()} cannot be")
             grid = Grid(tuple(lows.tolist()), tuple(highs.tolist()), values.shape)
             policy = cls(env.task, env.nominal, Readings.from_env(env), grid, values.ravel().astype(np.float64))
-        except Exception as error:  # see read_arrays
+        except (OSError, KeyError, TypeError, ValueError) as error:
             raise PolicyFileError(
-                f"{str(path)!r} is no value function, or is damaged ({type(error).__name__}: {error}): "
-                f"compute it again with `{_command(env_id)} --policy`"
+                f"{str(path)!r} is no value function, or is damaged ({type(error).__name__}: {error})"
+                f"{predecessor_hint(path)}: compute it again with `{_command(env_id)} --policy`"
             ) from None
         check_fingerprint(stored, env_id, [])
         return policy
@@ -979,8 +990,7 @@ def save_value(problem: Problem, value: ValueFunction, directory: Path = OPTIMUM
         "highs": np.array(value.grid.highs),
         "fingerprint": np.array(json.dumps(fingerprint(problem.env_id, []))),
     }
-    with atomic_file(path, "wb") as file:
-        np.savez_compressed(file, **content)  # type: ignore[arg-type]
+    save_arrays(path, content, compress=True, keep=True)
     return path
 
 

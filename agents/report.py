@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from agents import classical, evaluation, runs
 from sd_friction_env import ENVIRONMENT_IDS, OscillatorParameters, Table, amplitude_curve, plotting, simulate
 from sd_friction_env.policies import Actions, ConstantPolicy, Policy, State, ZeroPolicy
-from sd_friction_env.tables import atomic_file
+from sd_friction_env.storage import atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,23 +6,24 @@ A finished run is a folder with::
     policy.pt           the best model's weights (a table of tensors; read with weights_only=True)
     policy.npz          the same actor for plain NumPy (sd_friction_env.policies.load_policy)
     evaluations.csv     what each evaluation during training gave
-    checkpoints/        the last checkpoint: in an unfinished run all that is needed to go on as if nothing had happened
+    checkpoints/        the last checkpoint; in an unfinished run all that is needed to go on as if nothing had
+                        happened, and its predecessor, in case it is damaged
     tensorboard/        event files
 
 While it is being trained, the folder is called ``NAME.partial``; it gets its name, and its config.json the status
 "finished", when all else is written. So a half-written folder never looks like a finished one, whatever it is called.
 A run that was interrupted, or killed at any moment, goes on from its last checkpoint (:func:`agents.training.train`):
-``resumed`` in config.json says after how many steps that was done, and with which versions.
+``resumed`` in config.json says after how many steps that was done, and with which versions. One process at a time works
+on a run: it holds the lock ``.NAME.lock`` beside the folder.
 """
 
 import contextlib
-import hashlib
-import json
+import itertools
 import os
-import pickle
 import shutil
+import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,18 @@ import numpy as np
 from gymnasium import spaces
 
 from sd_friction_env.policies import NetworkPolicy, PolicyFileError, load_policy
-from sd_friction_env.tables import atomic_file
+from sd_friction_env.storage import (
+    LockedError,
+    StoredFileError,
+    file_digest,
+    locked,
+    naming,
+    open_archive,
+    open_regular,
+    read_json,
+    sealed_archive,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
@@ -88,23 +100,39 @@ def check_free(folder: Path, *, force: bool = False) -> None:
     for place, what in ((folder, "exists"), (partial_folder(folder), "is there from an unfinished run")):
         if not place.exists() and not place.is_symlink():
             continue
-        if not _is_replaceable(place):
-            raise RunFolderError(f"{str(place)!r} exists and is no run folder: choose another --run-folder")
+        reason = _reason_to_keep(place)
+        if reason:
+            raise RunFolderError(f"{str(place)!r} exists and is no run folder ({reason}): choose another --run-folder")
         if not force:
             raise RunFolderError(f"{str(place)!r} {what}: choose another --run-folder, or replace it with --force")
 
 
-def _is_replaceable(place: Path) -> bool:
-    """Tell whether removing ``place`` removes a run (or nothing at all) and not something precious."""
+def _reason_to_keep(place: Path) -> str:
+    """Return why removing ``place`` might remove something precious; "" if it is a run or empty."""
     if place.is_symlink() or not place.is_dir():
-        return False
+        return "it is a file or a link"
     if not any(place.iterdir()):
-        return True
+        return ""
     try:
-        config = json.loads((place / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(config, dict) and config.get("kind") == KIND
+        config = read_json(place / CONFIG)
+    except (OSError, StoredFileError) as error:
+        return str(error)
+    return "" if isinstance(config, dict) and config.get("kind") == KIND else f"its {CONFIG} is of something else"
+
+
+@contextlib.contextmanager
+def only_here(folder: Path) -> Iterator[None]:
+    """Keep other processes from working on the run that is to become ``folder``.
+
+    Raises:
+        RunFolderError: if one does so already, naming it. OSError: if the lock cannot be written.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with locked(folder.with_name(f".{folder.name}.lock"), f"run folder {str(folder)!r}"):
+            yield
+    except LockedError as error:
+        raise RunFolderError(str(error)) from None
 
 
 def begin(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> Path:
@@ -136,9 +164,16 @@ def write_unfinished(partial: Path, config: Mapping[str, Any]) -> None:
     write_json(partial / CONFIG, {"kind": KIND, "format": FORMAT, "status": "unfinished", **config})
 
 
-def last_checkpoint(partial: Path) -> Path | None:
-    """Return the last checkpoint of a partial folder; None if there is none yet."""
-    return max((partial / CHECKPOINTS).glob("step_*.pt"), default=None)
+def checkpoints(partial: Path) -> list[Path]:
+    """Return the checkpoints of a run, the last one first."""
+    return sorted((partial / CHECKPOINTS).glob("step_*.pt"), reverse=True)
+
+
+def keep_checkpoints(partial: Path, *kept: Path | None) -> None:
+    """Remove all checkpoints of a run but those named."""
+    for path in checkpoints(partial):
+        if path not in kept:
+            path.unlink()
 
 
 def remove_leftovers(partial: Path) -> None:
@@ -158,11 +193,11 @@ def finish(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> N
         RunFolderError: if something has taken the name meanwhile and ``force`` is not given.
     """
     partial = partial_folder(folder)
-    files = {name: _digest(partial / name) for name in (WEIGHTS, NETWORK, EVALUATIONS)}
+    files = {name: file_digest(partial / name) for name in (WEIGHTS, NETWORK, EVALUATIONS)}
     content = {"kind": KIND, "format": FORMAT, "status": "finished", **config, "files": files}
     write_json(partial / CONFIG, content)
     if folder.exists():
-        if not force or not _is_replaceable(folder):
+        if not force or _reason_to_keep(folder):
             raise RunFolderError(f"{str(folder)!r} exists by now: the finished run is left in {str(partial)!r}")
         old = folder.with_name(folder.name + ".old" + PARTIAL)
         if old.exists():
@@ -174,27 +209,40 @@ def finish(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> N
         os.replace(partial, folder)
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file, whole or not at all."""
-    from sd_friction_env.tables import atomic_file
+class _File:
+    """A file that remembers why it could not be written: torch says only that it could not."""
 
-    with atomic_file(path) as file:
-        json.dump(content, file, indent=2, allow_nan=False)
-        file.write("\n")
+    def __init__(self, file: Any) -> None:
+        self.file = file
+        self.error: OSError | None = None
 
+    def write(self, data: Any) -> int:
+        try:
+            return int(self.file.write(data))
+        except OSError as error:
+            self.error = error
+            raise
 
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    def flush(self) -> None:
+        self.file.flush()
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
-    """Write tensors and plain values with torch.save, whole or not at all, also if the machine fails."""
+    """Write tensors and plain values with torch.save, sealed, whole or not at all, also if the machine fails.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
     import torch
 
-    with atomic_file(path, "wb") as file:
-        torch.save(dict(content), file)
-        file.flush()
-        os.fsync(file.fileno())
+    with sealed_archive(path) as file:
+        target: Any = _File(file)
+        try:
+            torch.save(dict(content), target)
+        except RuntimeError:
+            if target.error is not None:
+                raise target.error from None
+            raise
 
 
 def describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
@@ -253,10 +301,10 @@ def load_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
     if missing or config["algorithm"] not in ALGORITHMS or not isinstance(config["files"], dict):
         what = f"lacks {missing[0]!r}" if missing else "holds values that cannot be"
         raise RunFolderError(f"{name!r} is damaged: its {CONFIG} {what}")
-    for file in (WEIGHTS, NETWORK):
+    for file in (WEIGHTS, NETWORK, EVALUATIONS):
         try:
-            digest = _digest(place / file)
-        except OSError:
+            digest = file_digest(place / file)
+        except (OSError, StoredFileError):
             raise RunFolderError(f"{name!r} is damaged: {file} is missing or cannot be read") from None
         if digest != config["files"].get(file):
             raise RunFolderError(f"{name!r} is damaged: {file} is not the file that {CONFIG} speaks of")
@@ -266,8 +314,8 @@ def load_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
 def _read_config(place: Path) -> dict[str, Any]:
     name = str(place)
     try:
-        config = json.loads((place / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        config = read_json(place / CONFIG)
+    except (OSError, StoredFileError) as error:
         raise RunFolderError(f"{name!r} is not a run folder: its {CONFIG} cannot be read ({error})") from None
     if not isinstance(config, dict) or config.get("kind") != KIND:
         raise RunFolderError(f"{name!r} is not a run folder of sd_friction_env")
@@ -324,19 +372,21 @@ def load_torch_policy(folder: str | os.PathLike[str], device: str = "cpu") -> "B
     from agents.training import build_policy
 
     config = load_config(folder)
+    weights = load_tensors(Path(folder) / WEIGHTS)
     try:
+        policy_kwargs = config["hyperparameters"].get("policy_kwargs", {})
+        _check_size(policy_kwargs, weights)
         observation_space, action_space = (
             described_space(config["spaces"][kind]) for kind in ("observation", "action")
         )
-        policy = build_policy(
-            config["algorithm"],
-            observation_space,
-            action_space,
-            config["hyperparameters"].get("policy_kwargs", {}),
-        )
-    except (KeyError, TypeError, ValueError) as error:
+        policy = build_policy(config["algorithm"], observation_space, action_space, policy_kwargs)
+        for name, tensor in policy.state_dict().items():
+            if name in weights and weights[name].dtype != tensor.dtype:
+                raise ValueError(f"{name} in {WEIGHTS} is {weights[name].dtype}, not {tensor.dtype}")
+            if name in weights and not weights[name].isfinite().all():
+                raise ValueError(f"{name} in {WEIGHTS} has entries that are not finite")
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunFolderError(f"{os.fspath(folder)!r} is damaged: {error}") from None
-    weights = load_tensors(Path(folder) / WEIGHTS)
     try:
         policy.load_state_dict(weights, strict=True)
     except (RuntimeError, TypeError, AttributeError) as error:
@@ -346,19 +396,42 @@ def load_torch_policy(folder: str | os.PathLike[str], device: str = "cpu") -> "B
     return policy.to(device)
 
 
-def load_tensors(path: Path) -> dict[str, Any]:
+def _check_size(policy_kwargs: Any, weights: Mapping[str, Any]) -> None:
+    """Raise if a policy would have more weights than there are: it is then not even built."""
+    from agents.training import parse_policy_kwargs
+
+    kwargs = parse_policy_kwargs(policy_kwargs)
+    nets = kwargs.get("net_arch", [])
+    least = kwargs.get("n_critics", 1) * sum(
+        before * after
+        for widths in (nets.values() if isinstance(nets, dict) else [nets])
+        for before, after in itertools.pairwise([1, *widths, kwargs.get("n_quantiles", 1)])
+    )
+    there = sum(tensor.numel() for tensor in weights.values())
+    if least > there:
+        raise ValueError(f"{WEIGHTS} does not fit {CONFIG}: it has {there:,} weights, and {least:,} or more are needed")
+
+
+def load_tensors(path: Path, *, sealed: bool = False) -> dict[str, Any]:
     """Return what :func:`save_tensors` wrote; a file that asks for code to be run is refused.
 
+    Args:
+        sealed: whether a file without a seal is refused.
+
     Raises:
-        RunFolderError: if it is anything but a table of tensors and plain values.
+        RunFolderError: if it is damaged, or anything but a table of tensors and plain values.
     """
     import torch
 
-    content: Any = None
-    refusals = (pickle.UnpicklingError, RuntimeError, ValueError, EOFError, OSError, KeyError, TypeError, UserWarning)
-    with contextlib.suppress(*refusals), warnings.catch_warnings():
-        warnings.simplefilter("error")  # torch only warns of pickles that it did not write
-        content = torch.load(path, map_location="cpu", weights_only=True)
+    try:
+        with naming(path), open_regular(path, sys.maxsize) as file:
+            with open_archive(file, sealed=sealed, compressed=False):
+                file.seek(0)
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # torch only warns of pickles that it did not write
+                content = torch.load(file, map_location="cpu", weights_only=True)
+    except (OSError, StoredFileError) as error:
+        raise RunFolderError(f"{error}: it is not a table of tensors, or is damaged") from None
     if not isinstance(content, dict):
         raise RunFolderError(f"{str(path)!r} is not a table of tensors: refused")
     return content

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import inspect
+import itertools
 import json
 import math
 import numbers
@@ -22,7 +23,6 @@ import numpy as np
 import sb3_contrib
 import stable_baselines3
 import torch
-import yaml
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -49,6 +49,7 @@ from sd_friction_env import ENVIRONMENT_IDS, Table
 from sd_friction_env.callbacks import AnnealedExploration
 from sd_friction_env.policies import NetworkPolicy
 from sd_friction_env.sb3 import SDFrictionVecEnv
+from sd_friction_env.storage import StoredFileError, content_digest, read_yaml
 from sd_friction_env.wrappers import LARGEST_POWER, LARGEST_SCALE, SMALLEST_POWER, SMALLEST_SCALE, scaled_reward
 
 HYPERPARAMETERS = Path(__file__).parent / "hyperparameters"
@@ -60,10 +61,10 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 }
 ACTIVATIONS: dict[str, type[nn.Module]] = {"Tanh": nn.Tanh, "ReLU": nn.ReLU}
 
-LARGEST_SEED = 2**32 - 1
+LARGEST_SEED, MOST_WEIGHTS = 2**32 - 1, 2**25
 _WRAPPER = "sd_friction_env.wrappers.ScaledReward"
 _CALLBACK = "sd_friction_env.callbacks.AnnealedExploration"
-_CHECKPOINT_FORMAT = 1
+_CHECKPOINT_FORMAT = 2
 
 
 # Hyperparameters ------------------------------------------------------------------------------------------------------
@@ -80,13 +81,24 @@ class _Number:
     def check(self, name: str, value: Any) -> float | int:
         kind = "whole number" if self.whole else "number"
         low, high = (f"{end:.0f}" if self.whole else f"{end:g}" for end in (self.low, self.high))
-        said = f"{name} must be a {kind} in [{low}, {high}], got {value!r}"
+        said = f"{name} must be a {kind} in [{low}, {high}], got {_shown(value)}"
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
             raise TypeError(said)
-        number = float(value)
+        try:
+            number = float(value)
+        except OverflowError:
+            raise ValueError(said) from None
         if not self.low <= number <= self.high or (self.whole and number != int(number)):
             raise ValueError(said)
         return int(number) if self.whole else number
+
+
+def _shown(value: Any) -> str:
+    """Return a value for a message, cut short where it is long."""
+    if isinstance(value, int) and abs(value) >= 10**100:
+        return f"a whole number of {value.bit_length()} bits"
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 _POSITIVE = _Number(1, 10**12, whole=True)
@@ -165,13 +177,16 @@ def read_hyperparameters(algorithm: str, env_id: str, path: Path | None = None) 
         raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, got {algorithm!r}")
     file = HYPERPARAMETERS / f"{algorithm}.yml" if path is None else path
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        content = read_yaml(file)
+    except (OSError, StoredFileError) as error:
         raise ValueError(f"hyperparameters cannot be read from {str(file)!r}: {_one_line(error)}") from None
     if not isinstance(content, dict) or not isinstance(content.get(env_id), dict):
         known = ", ".join(map(str, content)) if isinstance(content, dict) else "nothing"
         raise ValueError(f"{str(file)!r} has no hyperparameters for {env_id!r}; it has: {known}")
-    return check_hyperparameters(algorithm, content[env_id])
+    try:
+        return check_hyperparameters(algorithm, content[env_id])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{str(file)!r} has hyperparameters for {env_id} that cannot be used: {error}") from None
 
 
 def check_hyperparameters(algorithm: str, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -276,9 +291,9 @@ def parse_policy_kwargs(value: Any) -> dict[str, Any]:
         try:
             value = _literal(ast.parse(value.strip(), mode="eval").body)
         except (SyntaxError, RecursionError, MemoryError):
-            raise ValueError(f"policy_kwargs is not an expression: {value!r}") from None
+            raise ValueError(f"policy_kwargs is not an expression: {_shown(value)}") from None
     if not isinstance(value, Mapping):
-        raise ValueError(f"policy_kwargs must be dict(...), got {value!r}")
+        raise ValueError(f"policy_kwargs must be dict(...), got {_shown(value)}")
     checked: dict[str, Any] = {}
     for name, part in value.items():
         if name == "activation_fn":
@@ -303,8 +318,12 @@ def _checked_net_arch(value: Any) -> Any:
             raise ValueError(f"net_arch must have parts pi, vf or qf, got {value!r}")
         return {name: _checked_net_arch(part) for name, part in value.items()}
     if not isinstance(value, list) or len(value) > 32:
-        raise ValueError(f"net_arch must be a list of layer widths, got {value!r}")
-    return [_WIDTH.check("a width in net_arch", width) for width in value]
+        raise ValueError(f"net_arch must be a list of at most 32 layer widths, got {_shown(value)}")
+    widths = [int(_WIDTH.check("a width in net_arch", width)) for width in value]
+    weights = sum(before * after for before, after in itertools.pairwise(widths))
+    if weights > MOST_WEIGHTS:  # what is trained must be read again, and files are bounded
+        raise ValueError(f"net_arch must have at most {MOST_WEIGHTS:,} weights between its layers, got {weights:,}")
+    return widths
 
 
 def _literal(node: ast.expr) -> Any:
@@ -320,7 +339,7 @@ def _literal(node: ast.expr) -> Any:
         return ast.literal_eval(node)
     except (ValueError, TypeError):
         raise ValueError(
-            f"policy_kwargs may hold literals and nn.{', nn.'.join(ACTIVATIONS)}; got {ast.unparse(node)!r}"
+            f"policy_kwargs may hold literals and nn.{', nn.'.join(ACTIVATIONS)}; got {_shown(ast.unparse(node))}"
         ) from None
 
 
@@ -849,6 +868,7 @@ class _Supervisor(BaseCallback):
         self.seeds = validation_seeds(plan)
         self.seconds = 0.0  # of training in processes before this one
         self.noises: Mapping[str, torch.Tensor] = {}  # to go on with
+        self.checkpoint: Path | None = None  # the last one that is whole
         self.started = time.perf_counter()
         self.bar = tqdm(
             total=plan.steps,
@@ -860,12 +880,15 @@ class _Supervisor(BaseCallback):
             mininterval=0.5,
         )
 
-    def restore(self, saved: Mapping[str, Any], noises: Mapping[str, torch.Tensor], logger: Logger) -> None:
+    def restore(
+        self, checkpoint: Path, saved: Mapping[str, Any], noises: Mapping[str, torch.Tensor], logger: Logger
+    ) -> None:
         """Go on from what a checkpoint holds, and make the folder's tables and best model those of that moment.
 
         Args:
-            saved: as :meth:`own_state` returned it. noises: as :func:`_model_state` has them.
+            checkpoint: its file. saved: as :meth:`own_state` returned it. noises: as :func:`_model_state` has them.
         """
+        self.checkpoint = checkpoint
         self.rows, self.best, self.best_weights = saved["rows"], saved["best"], saved["best_weights"]
         self.seconds, self.noises = saved["seconds"], noises
         for name, (value, count, excluded) in saved["logged"].items():
@@ -973,14 +996,17 @@ class _Supervisor(BaseCallback):
         return Table({name: [row[name] for row in self.rows] for name in self.rows[0]})
 
     def save_checkpoint(self, *, at_end: bool = False) -> Path:
-        """Write all that is needed to go on from here, remove earlier checkpoints, and return the new file."""
-        place = self.folder / runs.CHECKPOINTS
-        path = place / f"step_{self.num_timesteps:012d}.pt"
-        content = {"format": _CHECKPOINT_FORMAT, "steps": self.num_timesteps, "run": self.own_state()}
+        """Write all that is needed to go on from here, keep the checkpoint before it, and return the new file."""
+        path = self.folder / runs.CHECKPOINTS / f"step_{self.num_timesteps:012d}.pt"
+        content = {
+            "format": _CHECKPOINT_FORMAT,
+            "plan": content_digest(configuration(self.plan)),
+            "steps": self.num_timesteps,
+            "run": self.own_state(),
+        }
         runs.save_tensors(path, content | _model_state(self.model, at_end=at_end))
-        for old in place.glob("step_*.pt"):
-            if old != path:
-                old.unlink()
+        runs.keep_checkpoints(self.folder, path, self.checkpoint)
+        self.checkpoint = path
         return path
 
 
@@ -1003,7 +1029,7 @@ def train(
     A run that was stopped or killed goes on from its last checkpoint, or begins anew if it had none yet. On the CPU the
     result is bit for bit that of a run which was not interrupted, but for wall times; rows of evaluations.csv and
     TensorBoard's events from after the checkpoint are dropped, for they come again. On CUDA it is as exact as two runs
-    of the same seed are there.
+    of the same seed are there. Should the last checkpoint be damaged, it goes on from the one before it.
 
     Args:
         folder: of the finished run. force: replace a run that is there.
@@ -1016,20 +1042,38 @@ def train(
         on_evaluation: called with every new row of evaluations.csv; it may raise to end the training.
 
     Warns:
-        UserWarning: if a run is resumed with other versions than it was begun with.
+        UserWarning: if a run is resumed with other versions than it was begun with, or its last checkpoint is damaged.
 
     Raises:
         TypeError, ValueError: if ``checkpoint_freq`` is no whole number in [1, 1e12].
         agents.runs.RunFolderError: if the folder is taken, or there is nothing to resume, or what is there is damaged
-            or of another plan; nothing is then written.
+            or of another plan, or another process works on it; nothing is then written.
+        OSError: if something cannot be written; the last checkpoint is then as it was.
         StoppedError: if ``should_stop`` said so; the folder keeps its partial name, also if ``on_evaluation`` raises.
     """
-    frames = int(plan.hyperparameters.get("frame_stack", 1))
     runs.check_free(folder, force=force or resume)
     begun = runs.load_unfinished(folder, force=force) if resume else None
     if checkpoint_freq is None:
         checkpoint_freq = (begun or {}).get("checkpoint_freq", plan.eval_freq)
     checkpoint_freq = checked_freq("checkpoint-freq", checkpoint_freq)
+    with runs.only_here(folder):
+        begun = runs.load_unfinished(folder, force=force) if resume else None  # another process may just have ended
+        return _train(plan, folder, begun, force, checkpoint_freq, progress, command, should_stop, on_evaluation)
+
+
+def _train(
+    plan: Plan,
+    folder: Path,
+    begun: Mapping[str, Any] | None,
+    force: bool,
+    checkpoint_freq: int,
+    progress: bool,
+    command: str,
+    should_stop: Callable[[], bool],
+    on_evaluation: Callable[[Mapping[str, Any]], None],
+) -> Result:
+    """Train as :func:`train` says, from scratch or from the last checkpoint of the run that was begun."""
+    frames = int(plan.hyperparameters.get("frame_stack", 1))
     threads = torch.get_num_threads()
     torch.set_num_threads(plan.threads)
     envs = make_training_envs(
@@ -1057,11 +1101,12 @@ def train(
         saved: dict[str, Any] | None = None
         if begun is not None:
             check_same(begun, plan, partial)
-            checkpoint = runs.last_checkpoint(partial)
-            if checkpoint is not None:
-                saved = _load_checkpoint(checkpoint, model, plan)
+            found = _last_whole_checkpoint(runs.checkpoints(partial))
+            if found is not None:
+                checkpoint, saved = found
+                _restore_checkpoint(checkpoint, saved, model, plan)
         if saved is None:
-            runs.begin(folder, config, force=force or resume)
+            runs.begin(folder, config, force=force or begun is not None)
         else:
             assert begun is not None
             then = {**begun["versions"], **(begun.get("resumed") or [{}])[-1].get("versions", {})}
@@ -1077,7 +1122,7 @@ def train(
         model.set_logger(logger)
         supervisor = _Supervisor(plan, partial, progress, should_stop, on_evaluation, checkpoint_freq)
         if saved is not None:
-            supervisor.restore(saved["run"], saved["noises"], logger)
+            supervisor.restore(checkpoint, saved["run"], saved["noises"], logger)
         # Off-policy algorithms log per episode, and all environments end theirs together.
         log_interval = 1 if plan.algorithm == "ppo" else plan.hyperparameters["n_envs"]
         model.learn(
@@ -1097,6 +1142,7 @@ def train(
         )
         actor.save(partial / runs.NETWORK)
         logger.close()
+        runs.keep_checkpoints(partial, supervisor.checkpoint)
         config |= {"steps": model.num_timesteps, "seconds": seconds, "best": supervisor.best}
         runs.finish(folder, config, force=force)
         return Result(folder, actor, model.num_timesteps, seconds, supervisor.best, supervisor.table())
@@ -1155,19 +1201,47 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return parts
 
 
-def _load_checkpoint(path: Path, model: BaseAlgorithm, plan: Plan) -> dict[str, Any]:
-    """Restore a model from a checkpoint, and return what the checkpoint holds.
+def _last_whole_checkpoint(paths: Sequence[Path]) -> tuple[Path, dict[str, Any]] | None:
+    """Return the first checkpoint that is not damaged and what it holds; None if there are none at all.
+
+    Warns:
+        UserWarning: naming those that are damaged.
 
     Raises:
-        agents.runs.RunFolderError: if it is damaged, of another format or of another run.
+        agents.runs.RunFolderError: if all are damaged.
     """
-    saved = runs.load_tensors(path)
+    damaged = []
+    for path in paths:
+        try:
+            saved = runs.load_tensors(path, sealed=True)
+        except runs.RunFolderError as error:
+            damaged.append(_one_line(error))
+            continue
+        if damaged:
+            said = f"a checkpoint is damaged ({'; '.join(damaged)}): resumed from its predecessor {str(path)!r}"
+            warnings.warn(said, stacklevel=4)
+        return path, saved
+    if damaged:
+        raise runs.RunFolderError(
+            f"no checkpoint can be used ({'; '.join(damaged)}): begin anew with --force and without --resume"
+        )
+    return None
+
+
+def _restore_checkpoint(path: Path, saved: Mapping[str, Any], model: BaseAlgorithm, plan: Plan) -> None:
+    """Restore a model from what a checkpoint holds.
+
+    Raises:
+        agents.runs.RunFolderError: if it is of another format or of another run.
+    """
     if saved.get("format") != _CHECKPOINT_FORMAT:
         raise runs.RunFolderError(
             f"checkpoint {str(path)!r} has format {saved.get('format')!r}, and this version resumes "
             f"{_CHECKPOINT_FORMAT}: begin anew with --force and without --resume"
         )
     try:
+        if saved["plan"] != content_digest(configuration(plan)):
+            raise ValueError("it was written with another configuration")
         _restore_model(model, saved, plan.steps)
         if not {"rows", "best", "best_weights", "seconds", "logged"} <= set(saved["run"]):
             raise ValueError("the record of the run is incomplete")
@@ -1175,7 +1249,6 @@ def _load_checkpoint(path: Path, model: BaseAlgorithm, plan: Plan) -> dict[str, 
         raise runs.RunFolderError(
             f"checkpoint {str(path)!r} is damaged or of another run: {_one_line(error)[:300]}"
         ) from None
-    return saved
 
 
 def versions() -> dict[str, str]:

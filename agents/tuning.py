@@ -44,7 +44,7 @@ from tqdm import tqdm
 from agents import evaluation, training
 from sd_friction_env.callbacks import AnnealedExploration
 from sd_friction_env.policies import Policy
-from sd_friction_env.tables import atomic_file
+from sd_friction_env.storage import StoredFileError, atomic_file, content_digest, read_text
 from sd_friction_env.wrappers import ScaledReward
 
 FORMAT = 1  # of what a study says of itself
@@ -55,7 +55,7 @@ OUT_HEADER = "# The best hyperparameters of a study by scripts/tune.py, in RL Zo
 
 _GRACE = 6
 _RETRIES = 3  # of a trial whose process dies; one that was interrupted is always tried again
-_CONFIGURATION = "configuration"
+_CONFIGURATION, _DIGEST = "configuration", "sha256"
 _CALLBACK = f"{AnnealedExploration.__module__}.{AnnealedExploration.__qualname__}"
 _WRAPPER = f"{ScaledReward.__module__}.{ScaledReward.__qualname__}"
 
@@ -485,12 +485,30 @@ def open_study(search: Search, storage: str, name: str, *, heartbeat: int = HEAR
             if isinstance(here[key], list | dict):
                 what = f"its {key} is not that of this search"
             raise StudyError(f"study {name!r} in {shown!r} is of another configuration: {what}; choose another name")
+    _check_trials(study)
     return study
 
 
 def _is_finished(trial: FrozenTrial) -> bool:
     failed = trial.state == TrialState.FAIL and "error" in trial.user_attrs  # by itself: it counts, and stays
     return trial.state in (TrialState.COMPLETE, TrialState.PRUNED) or failed
+
+
+def _trial_digest(trial: FrozenTrial | Trial, best: Mapping[str, Any]) -> str:
+    """Return the digest of what a complete trial has found: parameters, hyperparameters, seed and best evaluation."""
+    known = {name: trial.user_attrs.get(name) for name in ("hyperparameters", "seed")}
+    return content_digest({"params": dict(trial.params), "best": dict(best), **known})
+
+
+def _check_trials(study: optuna.Study) -> None:
+    """Raise unless the complete trials of a study are what was stored of them; those of earlier versions have no
+    digest."""
+    for trial in study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]):
+        digest, best = trial.user_attrs.get(_DIGEST), trial.user_attrs.get("best")
+        found = best if isinstance(best, dict) else {}
+        if trial.value != found.get("credited_return") or digest not in (None, _trial_digest(trial, found)):
+            name = f"trial {trial.number} of study {study.study_name!r}"
+            raise StudyError(f"{name} is damaged, or changed since it ended")
 
 
 def finished_trials(study: optuna.Study) -> list[FrozenTrial]:
@@ -616,6 +634,7 @@ def _objective(trial: Trial, search: Search, trials: int, should_stop: Callable[
     except (ValueError, RuntimeError, ArithmeticError) as error:  # a network that has diverged, memory that is full
         trial.set_user_attr("error", " ".join(f"{type(error).__name__}: {error}".split())[:500])
         raise
+    trial.set_user_attr(_DIGEST, _trial_digest(trial, best))
     return best["credited_return"]
 
 
@@ -824,7 +843,11 @@ def check_out(path: Path) -> None:
     """
     if path.is_dir() or not path.parent.is_dir():
         raise ValueError(f"out must be a file in a folder that exists, got {str(path)!r}")
-    if path.exists() and not path.read_text(encoding="utf-8", errors="replace").startswith(OUT_HEADER):
+    try:
+        is_ours = not path.exists() or read_text(path).startswith(OUT_HEADER)
+    except StoredFileError:
+        is_ours = False
+    if not is_ours:
         raise ValueError(f"out {str(path)!r} is there and no file of this program: choose another name")
 
 
@@ -835,6 +858,7 @@ def write_best(study: optuna.Study, path: Path) -> None:
         ValueError: if no trial is complete, or as :func:`check_out`. OSError: if it cannot be written.
     """
     check_out(path)
+    _check_trials(study)
     best = best_trials(study)
     if not best:
         raise ValueError(f"study {study.study_name!r} has no complete trial")

@@ -8,7 +8,7 @@ TOUR_TRAINING_STEPS=4096 in the environment makes the training short.
 from pathlib import Path
 from typing import Any
 
-from sd_friction_env.tables import atomic_file
+from sd_friction_env.storage import atomic_file
 
 NOTEBOOK = Path(__file__).with_name("tour.ipynb")
 

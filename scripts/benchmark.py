@@ -38,7 +38,7 @@ import numpy as np
 
 import sd_friction_env
 from sd_friction_env import OscillatorParameters, kernel, limit_cycle, plotting
-from sd_friction_env.tables import atomic_file, checked_ending
+from sd_friction_env.storage import atomic_file, checked_ending
 
 ROOT = Path(__file__).resolve().parent.parent
 FORCE, BELT = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0"

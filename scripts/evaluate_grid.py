@@ -19,7 +19,7 @@ from scripts.evaluate import check_fit, load_agent
 from scripts.train import TASKS, TIERS, Parser, environment_id
 from sd_friction_env import cli, load_pretrained
 from sd_friction_env.policies import Policy, ZeroPolicy
-from sd_friction_env.tables import checked_ending
+from sd_friction_env.storage import checked_ending
 
 
 def make_parser() -> Parser:

@@ -18,7 +18,7 @@ import numpy as np
 
 from sd_friction_env import OscillatorParameters, kernel
 from sd_friction_env.basins import LOST_CONTACT, UNDECIDED, Basins, basins
-from sd_friction_env.orbits import LimitCycle, equilibria, stick_intervals
+from sd_friction_env.orbits import equilibria, stick_intervals
 
 STARTS_OF_A_PLANT = 12
 SAME = 1e-5  # extremes of x, relative to the motion's size

@@ -117,17 +117,18 @@ def assignments(option: str, given: Sequence[str]) -> dict[str, Any]:
     Raises:
         ValueError: if one is not of that form.
     """
-    import yaml
+    from sd_friction_env.storage import StoredFileError, parse_yaml
 
     values: dict[str, Any] = {}
     for text in given:
         name, equals, value = text.partition("=")
         try:
             if not equals or not name.isidentifier():
-                raise ValueError
-            values[name] = yaml.safe_load(value)
-        except (ValueError, yaml.YAMLError):
-            raise ValueError(f"{option} must be NAME=VALUE with a value in YAML, got {text!r}") from None
+                raise StoredFileError("it has no name")
+            values[name] = parse_yaml(value)
+        except StoredFileError as error:
+            shown = repr(text[:200])
+            raise ValueError(f"{option} must be NAME=VALUE with a value in YAML, got {shown} ({error})") from None
     return values
 
 
@@ -231,7 +232,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"\ntrain.py: interrupted; what was written is in {str(partial)!r}; {go_on}", file=sys.stderr)
         return 130
     except OSError as error:
-        print(f"train.py: error: the run cannot be written: {error}", file=sys.stderr)
+        print(f"train.py: error: the run cannot be written: {error}; with space to write, {go_on}", file=sys.stderr)
+        return 1
+    except MemoryError as error:
+        print(f"train.py: error: the memory does not suffice for these hyperparameters: {error}", file=sys.stderr)
         return 1
     finally:
         signal.signal(signal.SIGINT, before)

@@ -29,7 +29,8 @@ from sd_friction_env.policies import Policy, VelocityFeedback, ZeroPolicy, load_
 from sd_friction_env.pretrained import load_pretrained
 from sd_friction_env.rendering import checked_size
 from sd_friction_env.simulation import simulate
-from sd_friction_env.tables import Table, atomic_file, checked_ending
+from sd_friction_env.storage import atomic_file, checked_ending
+from sd_friction_env.tables import Table
 
 FAILURE, BAD_USAGE, INTERRUPTED = 1, 2, 130
 

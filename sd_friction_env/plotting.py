@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from sd_friction_env.basins import Basins
 from sd_friction_env.forced import ForcedBasins
 from sd_friction_env.simulation import Trajectory
-from sd_friction_env.tables import Table, atomic_file, checked_ending
+from sd_friction_env.storage import atomic_file, checked_ending
+from sd_friction_env.tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.orbits import equilibria
 from sd_friction_env.parameters import checked_number
-from sd_friction_env.tables import atomic_file, checked_ending
+from sd_friction_env.storage import StoredFileError, checked_ending, load_arrays, naming, parse_json, save_arrays
 
 Actions = NDArray[np.float32]
 State = tuple[NDArray[Any], ...] | None
@@ -433,6 +433,13 @@ def _starts(episode_start: ArrayLike | None, like: NDArray[np.float64]) -> NDArr
     return np.broadcast_to(starts.reshape(()) if like.ndim == 0 and starts.size == 1 else starts, like.shape)
 
 
+def _real_numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{name} must be real numbers, got {array.dtype}")
+    return array.astype(np.float64)
+
+
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
@@ -467,7 +474,13 @@ class NetworkPolicy:
             raise ValueError(f"output must be one of {', '.join(OUTPUTS)}, got {self.output!r}")
         if not self.layers:
             raise ValueError("layers must not be empty")
-        layers = tuple((np.asarray(w, np.float64), np.asarray(b, np.float64)) for w, b in self.layers)
+        if isinstance(self.frames, bool) or not isinstance(self.frames, int | np.integer):
+            raise TypeError(f"frames must be a whole number, got {self.frames!r}")
+        if not isinstance(self.metadata, Mapping):
+            raise TypeError(f"metadata must be a mapping, got {type(self.metadata).__name__}")
+        layers = tuple(
+            (_real_numbers(f"weights {i}", w), _real_numbers(f"bias {i}", b)) for i, (w, b) in enumerate(self.layers)
+        )
         size: int | None = None
         for number, (weights, bias) in enumerate(layers):
             fits = weights.ndim == 2 and bias.shape == weights.shape[1:] and size in (None, weights.shape[0])
@@ -481,7 +494,7 @@ class NetworkPolicy:
         if size != 1:
             raise ValueError(f"the last layer must have 1 output, got {size}")
         inputs = layers[0][0].shape[0]
-        if self.frames < 1 or inputs % self.frames:
+        if self.frames < 1 or inputs < 1 or inputs % self.frames:
             raise ValueError(f"{inputs} inputs cannot be {self.frames} observations")
         object.__setattr__(self, "layers", layers)
 
@@ -538,7 +551,8 @@ class NetworkPolicy:
         """Write the policy as an .npz file, whole or not at all (weights in float32, as they were trained).
 
         Raises:
-            ValueError: if the name does not end in .npz. OSError: if the file cannot be written.
+            ValueError: if the name does not end in .npz, or the metadata cannot be read again.
+            OSError: if the file cannot be written.
         """
         target = Path(path)
         checked_ending(target, (".npz",))
@@ -551,12 +565,13 @@ class NetworkPolicy:
             "layers": len(self.layers),
             "metadata": dict(self.metadata),
         }
-        arrays: dict[str, Any] = {"header": np.array(json.dumps(header))}
+        text = json.dumps(header)
+        parse_json(text)
+        arrays: dict[str, Any] = {"header": np.array(text)}
         for i, (weights, bias) in enumerate(self.layers):
             arrays[f"weights_{i}"] = weights.astype(np.float32)
             arrays[f"bias_{i}"] = bias.astype(np.float32)
-        with atomic_file(target, "wb") as file:
-            np.savez(file, **arrays)
+        save_arrays(target, arrays)
 
 
 def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
@@ -567,39 +582,30 @@ def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
         PolicyFileError: if it is something else, or of a newer format.
     """
     name = os.fspath(path)
-    target = Path(path)
-    if target.is_dir():
+    if Path(path).is_dir():
         raise PolicyFileError(f"{name!r} is a folder; name the policy.npz in it")
-    if not target.exists():
-        raise FileNotFoundError(f"there is no policy file {name!r}")
     try:
-        (text,) = read_arrays(target, "header")
-        header = json.loads(str(text))
+        arrays = load_arrays(path, kinds="f", texts=("header",))
+        with naming(path):
+            header = parse_json(str(arrays.pop("header")))
         if not isinstance(header, dict) or header.get("kind") != _NETWORK_KIND:
             raise PolicyFileError(f"{name!r} is not a policy of sd_friction_env")
         if header["format"] != NETWORK_FORMAT:
             raise PolicyFileError(
                 f"{name!r} has policy format {header['format']!r}; this version reads {NETWORK_FORMAT}"
             )
-        count = int(header["layers"])
-        arrays = read_arrays(target, *(f"{part}_{i}" for i in range(count) for part in ("weights", "bias")))
-        layers = tuple(zip(arrays[::2], arrays[1::2], strict=True))
-        return NetworkPolicy(layers, header["activation"], header["output"], int(header["frames"]), header["metadata"])
+        count = header["layers"]
+        if type(count) is not int or 2 * count != len(arrays):
+            raise ValueError(f"its header speaks of {count!r} layers, and it holds {len(arrays)} arrays")
+        layers = tuple((arrays[f"weights_{i}"], arrays[f"bias_{i}"]) for i in range(count))
+        return NetworkPolicy(layers, header["activation"], header["output"], header["frames"], header["metadata"])
+    except FileNotFoundError:
+        raise FileNotFoundError(f"there is no policy file {name!r}") from None
     except PolicyFileError:
         raise
-    except Exception as error:  # see read_arrays
+    except StoredFileError as error:
+        raise PolicyFileError(f"{error}: it is not a policy of sd_friction_env, or is damaged") from None
+    except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise PolicyFileError(
             f"{name!r} is not a policy of sd_friction_env, or is damaged: {type(error).__name__}: {error}"
         ) from None
-
-
-def read_arrays(path: str | os.PathLike[str], *names: str) -> list[NDArray[Any]]:
-    """Return arrays of an .npz file by name; nothing in the file is ever executed.
-
-    Raises:
-        Exception: of any kind, if the file is damaged: a few wrong bytes make the archive, its compression, its
-            encryption or an array's header fail, each in ways of its own. Callers name the file.
-    """
-    # Opened here, for np.load leaves a file that it refuses open.
-    with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-        return [archive[name] for name in names]

@@ -2,23 +2,27 @@
 
 All goes through joblib, so that the backend ("sequential", "loky", "dask", "ray") and an address are all that changes.
 A sweep is cut into chunks by what it computes, never by who computes: the same bits come from any backend and any
-number of workers. With a folder every finished chunk is kept, with its checksum in its name, and a sweep that was
-killed goes on where it was.
+number of workers. With a folder every finished chunk is kept, with its checksum in its name and the sweep that it
+belongs to inside, and a sweep that was killed goes on where it was. One process at a time works in a folder.
 """
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib
 import importlib.metadata
 import io
 import json
+import multiprocessing
 import os
 import re
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, Self, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +31,19 @@ from sd_friction_env.basins import Basins, basins, checked_grid
 from sd_friction_env.curves import amplitude_curve, attractor_curves, checked_belt_speeds, cycle_table
 from sd_friction_env.forced import Direction, bifurcation_diagram
 from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_choice, checked_number
-from sd_friction_env.tables import Table, atomic_file
+from sd_friction_env.storage import (
+    LockedError,
+    StoredFileError,
+    atomic_file,
+    content_digest,
+    locked,
+    naming,
+    parse_json,
+    read_arrays,
+    read_bytes,
+    write_arrays,
+)
+from sd_friction_env.tables import Table
 
 Backend = Literal["sequential", "loky", "dask", "ray"]
 Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -37,13 +53,17 @@ BACKENDS: tuple[Backend, ...] = get_args(Backend)
 STARTS_A_CHUNK, SPEEDS_A_CHUNK = 250_000, 25
 _MOST_WORKERS = 10_000
 _CHUNKS_A_WORKER = 2  # in each wave, where results come in waves
+_WATCH = 0.5  # seconds between two looks at whether the parent lives
 _PATIENCE = 3  # times that workers may be lost in a row with no chunk finished between
 _EXTRAS = {"loky": "sweep", "dask": "dask", "ray": "ray"}
-_MANIFEST = "sweep.json"
+_MANIFEST, _LOCK = "sweep.json", ".sweep.lock"
+_LARGEST_MANIFEST = 2**27  # bytes
+_BELONGS = "belongs to"  # name of the text in a chunk's file that says to which sweep, and where in it
+_COLUMN_KINDS = "biufcU"
 
 
 class SweepError(ValueError):
-    """A folder belongs to another sweep, or workers are lost again and again."""
+    """A folder belongs to another sweep or is in use, or workers cannot be started or are lost again and again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,10 +119,15 @@ def run_chunks(
         description: of the whole sweep, JSON values; a folder with another is refused.
 
     Raises:
-        SweepError: if the folder holds another sweep, or workers are lost again and again.
+        SweepError: if the folder holds another sweep or is in use, or workers cannot be started or are lost again and
+            again.
         OSError: if the folder cannot be written to.
     """
-    store = _Store(engine.folder, len(chunks), description)
+    with _Store(engine.folder, len(chunks), description) as store:
+        return _run_chunks(function, chunks, engine, store)
+
+
+def _run_chunks(function: ChunkFunction, chunks: Sequence[Any], engine: Engine, store: "_Store") -> list[Columns]:
     results: dict[int, Columns] = dict(store.finished())
     show = engine.progress or (lambda done, total: None)
     if results:
@@ -130,6 +155,30 @@ def _numbered(function: ChunkFunction, index: int, chunk: Any) -> tuple[int, Col
     return index, function(chunk)
 
 
+def _numbered_in_child(function: ChunkFunction, index: int, chunk: Any) -> tuple[int, Columns]:
+    """Compute a numbered chunk in a worker process, which ends with the process that has started it."""
+    _end_with_parent()
+    return index, function(chunk)
+
+
+@functools.cache
+def _end_with_parent() -> None:
+    """Start a thread that ends this process when its parent has died, be it by ``kill -9``."""
+
+    def watch() -> None:
+        if os.name == "posix":
+            while os.getppid() == parent:
+                time.sleep(_WATCH)
+        elif (started_by := multiprocessing.parent_process()) is not None:  # elsewhere the parent's id stays
+            started_by.join()
+        else:
+            return
+        os._exit(1)
+
+    parent = os.getppid()
+    threading.Thread(target=watch, name="end with parent", daemon=True).start()
+
+
 Runner: TypeAlias = Callable[[ChunkFunction, list[tuple[int, Any]]], Iterator[tuple[int, Columns]]]
 
 
@@ -142,8 +191,10 @@ def _workers(engine: Engine) -> Iterator[Runner]:
     joblib: Any = importlib.import_module("joblib")
     with contextlib.ExitStack() as stack:
         threads: dict[str, Any] = {}
+        compute = _numbered
         if engine.backend == "loky":
             threads = {"inner_max_num_threads": 1}
+            compute = _numbered_in_child  # the workers of the others look after themselves
         elif engine.backend == "dask":
             stack.enter_context(_dask_client(engine))
         else:
@@ -162,7 +213,7 @@ def _workers(engine: Engine) -> Iterator[Runner]:
                     parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
                     waves = [numbered]
                 for part in waves:
-                    yield from parallel(joblib.delayed(_numbered)(function, *pair) for pair in part)
+                    yield from parallel(joblib.delayed(compute)(function, *pair) for pair in part)
 
         yield run
 
@@ -178,12 +229,14 @@ def _dask_client(engine: Engine) -> Iterator[None]:
         with client:
             yield
         return
-    with (
-        distributed.LocalCluster(
-            n_workers=engine.workers, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
-        ) as cluster,
-        distributed.Client(cluster),
-    ):
+    with contextlib.ExitStack() as stack:
+        try:
+            cluster = distributed.LocalCluster(
+                n_workers=engine.workers, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+            )
+            stack.enter_context(distributed.Client(stack.enter_context(cluster)))
+        except (OSError, RuntimeError) as error:
+            raise SweepError(f"a Dask cluster on this machine could not be started: {_causes(error)}") from None
         yield
 
 
@@ -196,13 +249,21 @@ def _ray(engine: Engine) -> Iterator[None]:
         local: dict[str, Any] = {"include_dashboard": False, "num_cpus": engine.workers}
         try:
             ray.init(engine.address, log_to_driver=False, **(local if engine.address is None else {}))
-        except ConnectionError as error:
+        except (OSError, RuntimeError) as error:
+            if engine.address is None:
+                raise SweepError(f"a Ray cluster on this machine could not be started: {_causes(error)}") from None
             raise SweepError(f"address {engine.address!r} is of no Ray cluster that answers: {error}") from None
     try:
         yield
     finally:
         if started:
             ray.shutdown()
+
+
+def _causes(error: BaseException) -> str:
+    """Return an error and what it was caused by, in one line."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if error.__cause__ is None else f"{text} {_causes(error.__cause__)}"
 
 
 def _worker_losses(backend: Backend) -> tuple[type[Exception], ...]:
@@ -221,55 +282,97 @@ def _worker_losses(backend: Backend) -> tuple[type[Exception], ...]:
 
 class _Store:
     """A folder of finished chunks: a manifest that says what of, and one file each, whose name ends with the checksum
-    of what is in it. Without a folder nothing is kept."""
+    of what is in it. Without a folder nothing is kept. While it is open, no other process may open it."""
 
     def __init__(self, folder: str | os.PathLike[str] | None, count: int, description: Mapping[str, Any]) -> None:
         self.folder = None if folder is None else Path(folder)
+        self.count = count
+        self.wanted = {"sd_friction_env": importlib.metadata.version("sd-friction-env"), "chunks": count, **description}
+        self.digest = content_digest(self.wanted)
+        self.stack = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
         if self.folder is None:
-            return
-        wanted = {"sd_friction_env": importlib.metadata.version("sd-friction-env"), "chunks": count, **description}
-        wanted = json.loads(json.dumps(wanted))
+            return self
         if self.folder.exists() and not self.folder.is_dir():
             raise SweepError(f"folder {str(self.folder)!r} is a file")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        manifest = self.folder / _MANIFEST
-        if not manifest.exists():
-            if any(self.folder.iterdir()):
-                raise SweepError(f"folder {str(self.folder)!r} holds other files: take an empty one, or a new name")
-            with atomic_file(manifest) as file:
-                json.dump(wanted, file, indent=1)
-            return
+        with contextlib.ExitStack() as stack:
+            self._check()  # before anything is written to the folder of somebody else
+            self.folder.mkdir(parents=True, exist_ok=True)
+            try:
+                stack.enter_context(locked(self.folder / _LOCK, f"folder {str(self.folder)!r}"))
+            except LockedError as error:
+                raise SweepError(str(error)) from None
+            if not self._check():
+                with atomic_file(self.folder / _MANIFEST) as file:
+                    file.write(self._manifest())
+            self.stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stack.close()
+
+    def _manifest(self) -> str:
+        return json.dumps(self.wanted, indent=1)
+
+    def _check(self) -> bool:
+        """Return whether the folder has the manifest of this sweep; raise if it holds anything else."""
+        assert self.folder is not None
+        manifest, name = self.folder / _MANIFEST, str(self.folder)
         try:
-            stored = json.loads(manifest.read_text(encoding="utf-8"))
-        except ValueError:
-            raise SweepError(f"{str(manifest)!r} is damaged: remove the folder to begin anew") from None
-        for name in sorted(wanted.keys() | stored.keys()):
-            if wanted.get(name) != stored.get(name):
-                raise SweepError(
-                    f"folder {str(self.folder)!r} holds another sweep: its {name} is {stored.get(name)!r}, "
-                    f"not {wanted.get(name)!r}"
-                )
+            text = read_bytes(manifest, _LARGEST_MANIFEST).decode("utf-8")
+            if text == self._manifest():
+                return True
+            stored = parse_json(text)
+        except FileNotFoundError:
+            others = self.folder.iterdir() if self.folder.is_dir() else ()
+            if any(not (path.name == _LOCK or path.name.startswith(f".{_MANIFEST}.")) for path in others):
+                raise SweepError(f"folder {name!r} holds other files: take an empty one, or a new name") from None
+            return False
+        except (StoredFileError, UnicodeDecodeError) as error:
+            raise SweepError(f"{str(manifest)!r} is damaged ({error}): remove the folder to begin anew") from None
+        if not isinstance(stored, dict):
+            raise SweepError(f"{str(manifest)!r} is damaged: remove the folder to begin anew")
+        wanted = json.loads(self._manifest())
+        for key in sorted(wanted.keys() | stored.keys()):
+            if wanted.get(key) != stored.get(key):
+                was, now = (_shortened(part.get(key)) for part in (stored, wanted))
+                raise SweepError(f"folder {name!r} holds another sweep: its {key} is {was}, not {now}")
+        return True
 
     def finished(self) -> Iterator[tuple[int, Columns]]:
-        """Yield the chunks that are there and whole; remove what is not."""
+        """Yield the chunks that are there, whole and of this sweep; remove the others, for they are computed again."""
         for path in sorted(self.folder.glob("chunk-*.npz")) if self.folder else []:
-            named = re.fullmatch(r"chunk-(\d+)-([0-9a-f]{64})\.npz", path.name)
-            data = path.read_bytes()
-            if named is None or hashlib.sha256(data).hexdigest() != named[2]:
+            named = re.fullmatch(r"chunk-(\d{1,9})-([0-9a-f]{64})\.npz", path.name)
+            columns: Columns | None = None
+            with contextlib.suppress(StoredFileError), naming(path):
+                data = read_bytes(path)
+                if named is not None and hashlib.sha256(data).hexdigest() == named[2]:
+                    columns = read_arrays(io.BytesIO(data), _COLUMN_KINDS, texts=(_BELONGS,))
+            if named and columns and str(columns.pop(_BELONGS, "")) == self._place(int(named[1])):
+                yield int(named[1]), columns
+            elif path.is_dir():
+                raise SweepError(f"{str(path)!r} must be a file; it is a folder")
+            else:
                 path.unlink()
-                continue
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                yield int(named[1]), dict(arrays)
 
     def keep(self, index: int, columns: Columns) -> None:
         """Write a chunk, whole or not at all."""
         if self.folder is None:
             return
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, allow_pickle=False, **columns)
+        write_arrays(buffer, {**columns, _BELONGS: np.array(self._place(index))}, compress=True)
         data = buffer.getvalue()
         with atomic_file(self.folder / f"chunk-{index:06d}-{hashlib.sha256(data).hexdigest()}.npz", "wb") as file:
             file.write(data)
+
+    def _place(self, index: int) -> str:
+        return f"{self.digest} {index} of {self.count}"
+
+
+def _shortened(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 # What is swept ------------------------------------------------------------------------------------------------------

@@ -1,14 +1,14 @@
 """Tidy tables: named columns of equal length, light enough for the base install."""
 
-import contextlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from sd_friction_env.storage import LARGEST_ARCHIVE, atomic_file, read_text
 
 
 class Table(dict[str, NDArray[Any]]):
@@ -71,8 +71,7 @@ class Table(dict[str, NDArray[Any]]):
         """
         import csv
 
-        with open(path, encoding="utf-8", newline="") as file:
-            lines = file.read().splitlines()
+        lines = read_text(path, LARGEST_ARCHIVE).splitlines()
         metadata = {}
         while lines and lines[0].startswith("# "):
             key, _, value = lines.pop(0)[2:].partition(": ")
@@ -93,37 +92,3 @@ def _cell(value: Any) -> str:
     if isinstance(value, str):
         return '"' + value.replace('"', '""') + '"' if any(mark in value for mark in ',"\n') else value
     return repr(value)
-
-
-def checked_ending(path: str | os.PathLike[str], endings: Sequence[str], name: str = "path") -> str:
-    """Return the ending of a file's name, in lower case.
-
-    Raises:
-        ValueError: if it is none of ``endings``; ``name`` is what the message calls the path.
-    """
-    ending = Path(path).suffix.lower()
-    if ending not in endings:
-        *others, last = endings
-        known = f"{', '.join(others)} or {last}" if others else last
-        raise ValueError(f"{name} must end in {known}, got {os.fspath(path)!r}")
-    return ending
-
-
-@contextlib.contextmanager
-def atomic_file(path: str | os.PathLike[str], mode: str = "w") -> Iterator[Any]:
-    """Open a file beside ``path`` (mode "w" for text, "wb" for bytes) and put it in its place only when it is whole.
-
-    Raises:
-        OSError: if the folder cannot be written to.
-    """
-    target = Path(path)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    text = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
-    try:
-        with open(partial, mode, **text) as file:  # type: ignore[call-overload]
-            yield file
-        os.replace(partial, target)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(partial)
-        raise

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env.env import SDFrictionEnv
 from sd_friction_env.policies import Policy, State, ZeroPolicy
-from sd_friction_env.tables import checked_ending
+from sd_friction_env.storage import checked_ending
 
 FORMATS = (".gif", ".mp4")
 MOST_STEPS = 100_000

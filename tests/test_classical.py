@@ -17,7 +17,7 @@ import pytest
 
 from agents import classical, evaluation
 from scripts import tune_classical
-from sd_friction_env import ENVIRONMENT_IDS, equilibria, theory
+from sd_friction_env import ENVIRONMENT_IDS, equilibria, storage, theory
 from sd_friction_env.policies import ConstantPolicy, LinearFeedback, VelocityFeedback
 
 ROOT = Path(__file__).parent.parent
@@ -249,7 +249,7 @@ def test_each_entry_keeps_its_own_versions_and_a_worse_one_is_not_kept(tmp_path,
     stored = classical.stored_gains(file)
     assert stored[FORCE]["velocity feedback"]["versions"] == {"scipy": "1.0"}
     assert stored[BELT]["velocity feedback"]["versions"] == {"scipy": "2.0"}
-    assert set(json.loads(file.read_text())) == {"gains"}
+    assert set(json.loads(file.read_text())) == {"gains", "sha256"}
     # A worse one leaves it; a better one does not; and it counts what the stored one comes to now, not what it says.
     worse = GAIN | classical.measured("velocity feedback", FORCE, {"gain": 0.3}) | {"values": {"gain": 0.3}}
     assert classical.keep(FORCE, "velocity feedback", worse, file) == first
@@ -259,6 +259,9 @@ def test_each_entry_keeps_its_own_versions_and_a_worse_one_is_not_kept(tmp_path,
     content = json.loads(file.read_text())
     content["gains"][FORCE]["velocity feedback"] = worse | {"validation_return": 0.0}
     file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"gains\.json.*differs from its digest.*predecessor is kept in.*\.previous"):
+        classical.keep(FORCE, "velocity feedback", best, file)
+    storage.write_json(file, content)
     assert classical.keep(FORCE, "velocity feedback", best, file) == best
     monkeypatch.setattr(classical, "GAINS_FILE", file)
     monkeypatch.setattr(classical, "tune", lambda name, env_id, **how: worse)
@@ -281,14 +284,16 @@ def test_what_several_keep_at_once_is_all_kept(tmp_path, monkeypatch):
         entry = GAIN | {"values": {"gain": 1.0, "delay": 3.0}}
         list(pool.map(classical.keep, ENVIRONMENT_IDS, names, [entry] * len(names), [file] * len(names)))
     assert set(read(file)) == set(ENVIRONMENT_IDS)
-    assert [path.name for path in tmp_path.iterdir()] == ["gains.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["gains.json", "gains.json.previous"]
+    assert len(read(tmp_path / "gains.json.previous")) == len(ENVIRONMENT_IDS) - 1
 
 
 def test_a_lock_that_another_process_left_behind_does_not_stop_anyone(tmp_path):
     program = (
         "import os, sys, pathlib\n"
-        "from agents import classical\n"
-        "with classical._locked(pathlib.Path(sys.argv[1])):\n"
+        "from sd_friction_env import storage\n"
+        "path = pathlib.Path(sys.argv[1])\n"
+        "with storage.locked(path.with_name(f'.{path.name}.lock'), 'the gains'):\n"
         "    os._exit(1)\n"  # as if killed
     )
     file = tmp_path / "gains.json"
@@ -299,8 +304,8 @@ def test_a_lock_that_another_process_left_behind_does_not_stop_anyone(tmp_path):
 
 
 def test_where_there_is_no_fcntl_the_lock_is_that_of_windows(tmp_path, monkeypatch):
-    """Its lock gives up after ten tries: then it is tried again, and any other trouble is told."""
-    file, answers, asked = tmp_path / "gains.json", [errno.EDEADLK, None, errno.EACCES], []
+    """Its lock says that another one has it: then it is tried again, and any other trouble is told."""
+    file, answers, asked = tmp_path / "gains.json", [errno.EACCES, None, errno.EIO], []
 
     def locking(descriptor, mode, size):
         asked.append((mode, size))
@@ -308,10 +313,10 @@ def test_where_there_is_no_fcntl_the_lock_is_that_of_windows(tmp_path, monkeypat
         if answer is not None:
             raise OSError(answer, "no lock")
 
-    monkeypatch.setitem(sys.modules, "msvcrt", types.SimpleNamespace(LK_LOCK=1, locking=locking))
-    monkeypatch.setattr(classical, "sys", types.SimpleNamespace(platform="win32"))
+    monkeypatch.setitem(sys.modules, "msvcrt", types.SimpleNamespace(LK_NBLCK=2, locking=locking))
+    monkeypatch.setattr(storage, "sys", types.SimpleNamespace(platform="win32"))
     classical.keep(FORCE, "velocity feedback", GAIN, file)
-    assert asked == [(1, 1), (1, 1)]
+    assert asked == [(2, 1), (2, 1)]
     assert [path.name for path in tmp_path.iterdir()] == ["gains.json"]
     with pytest.raises(OSError, match="no lock"):
         classical.keep(BELT, "velocity feedback", GAIN, file)

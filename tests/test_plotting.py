@@ -16,7 +16,7 @@ from scripts import figure_3
 from sd_friction_env import OscillatorParameters, Table, amplitude_curve, load_pretrained, plotting, simulate
 from sd_friction_env.cli import main
 from sd_friction_env.policies import load_policy
-from sd_friction_env.tables import checked_ending
+from sd_friction_env.storage import checked_ending
 
 ROOT = Path(__file__).parent.parent
 # What a user may have asked for, and what may not be there: LaTeX, a font, a minus sign in a font, a backend.

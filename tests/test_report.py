@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import json
 import re
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from scripts import report as script
 from scripts.train import TASKS, TIERS, environment_id
 from sd_friction_env import OscillatorParameters, Table, limit_cycle
 from sd_friction_env.policies import ConstantPolicy, NetworkPolicy, VelocityFeedback, ZeroPolicy
+from sd_friction_env.storage import file_digest, write_json
 
 ROOT = Path(__file__).parent.parent
 FEW = Effort(episodes=3, resamples=50, points=3, phases=2)
@@ -77,11 +79,18 @@ def test_a_run_that_is_not_what_its_name_says_or_is_damaged_is_refused(tmp_path)
         report.find_agents(other.parent)
     damaged = make_run(tmp_path / "b", "force-nominal-ppo-0")
     (damaged / runs.EVALUATIONS).write_text("steps,seconds\n1,2\n")
-    with pytest.raises(runs.RunFolderError, match="must have the columns"):
+    with pytest.raises(runs.RunFolderError, match=r"evaluations\.csv is not the file that config\.json speaks of"):
         report.find_agents(damaged.parent)
     (damaged / runs.EVALUATIONS).unlink()
-    with pytest.raises(runs.RunFolderError, match="cannot be read"):
+    with pytest.raises(runs.RunFolderError, match=r"evaluations\.csv is missing or cannot be read"):
         report.find_agents(damaged.parent)
+    strange = make_run(tmp_path / "c", "force-nominal-ppo-0")
+    (strange / runs.EVALUATIONS).write_text("steps,seconds\n1,2\n")
+    config = json.loads((strange / runs.CONFIG).read_text())
+    config["files"][runs.EVALUATIONS] = file_digest(strange / runs.EVALUATIONS)
+    write_json(strange / runs.CONFIG, config)
+    with pytest.raises(runs.RunFolderError, match="must have the columns"):
+        report.find_agents(strange.parent)
     (damaged / runs.NETWORK).write_bytes(b"x")
     with pytest.raises(runs.RunFolderError, match="damaged"):
         report.find_agents(damaged.parent)

@@ -1,8 +1,10 @@
 """Sweeps in chunks: the same bits whoever computes them, and nothing finished is ever lost."""
 
 import contextlib
+import hashlib
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -257,6 +259,113 @@ def test_the_program_is_interrupted_and_goes_on(tmp_path):
     assert cli.main([*arguments[:5], "--out", str(tmp_path / "whole.csv")]) == 0
     rows, whole = (path.read_text().splitlines() for path in (out, tmp_path / "whole.csv"))
     assert [row for row in rows if row[0] != "#"] == [row for row in whole if row[0] != "#"]
+
+
+# Two at once, and what is left behind --------------------------------------------------------------------------------
+
+
+def test_chunks_of_another_sweep_or_another_place_are_computed_again(tmp_path):
+    chunks = [[1.0], [2.0], [3.0]]
+    run_chunks(double, chunks, Engine(folder=tmp_path / "a"), description={"what": "doubles"})
+    run_chunks(double, [[7.0], [8.0], [9.0]], Engine(folder=tmp_path / "b"), description={"what": "others"})
+    first, second, third = sorted((tmp_path / "a").glob("chunk-*.npz"))
+    data = first.read_bytes()
+    first.unlink()
+    shutil.copy(next((tmp_path / "b").glob("chunk-000000-*")), tmp_path / "a")  # another sweep's
+    second.unlink()
+    (tmp_path / "a" / f"chunk-000001-{hashlib.sha256(data).hexdigest()}.npz").write_bytes(data)  # that of another place
+    (tmp_path / "a" / f"chunk-000009-{hashlib.sha256(data).hexdigest()}.npz").write_bytes(data)  # of none
+    found = run_chunks(double, chunks, Engine(folder=tmp_path / "a"), description={"what": "doubles"})
+    assert [part["doubled"].tolist() for part in found] == [[2.0], [4.0], [6.0]]
+    assert [list(part) for part in found] == [["doubled"]] * 3
+    assert finished(tmp_path / "a") == [0, 1, 2]
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"[" * 10**5, b"\xff", b'{"chunks": 1, "chunks": 2}'])
+def test_a_damaged_manifest_is_named_and_nothing_is_removed(content, tmp_path):
+    run_chunks(double, [[1.0]], Engine(folder=tmp_path), description={})
+    (tmp_path / "sweep.json").write_bytes(content)
+    with pytest.raises(SweepError, match=r"sweep\.json' is damaged.*remove the folder"):
+        run_chunks(double, [[1.0]], Engine(folder=tmp_path), description={})
+    assert finished(tmp_path) == [0]
+
+
+def test_a_sweep_killed_while_it_wrote_its_manifest_begins_anew(tmp_path):
+    (tmp_path / ".sweep.json.4711.partial").write_text("{")
+    (tmp_path / ".sweep.lock").touch()
+    run_chunks(double, [[1.0]], Engine(folder=tmp_path), description={})
+    assert finished(tmp_path) == [0]
+
+
+def test_a_second_sweep_in_a_folder_is_refused_by_the_name_of_the_first(tmp_path):
+    kept = tmp_path / "kept"
+    thread, results = sweep_in_a_thread(Engine(folder=kept), tmp_path, 1)
+    until(lambda: begun(tmp_path), "the first has begun")
+    with pytest.raises(SweepError, match=rf"kept' is in use by process {os.getpid()} on .* since "):
+        run_chunks(double, [[1.0]], Engine(folder=kept), description={"what": "waits"})
+    end_of(thread, tmp_path, results, 1)
+    assert sorted(path.name.split("-")[0] for path in kept.iterdir()) == ["chunk", "sweep.json"]
+
+
+def is_running(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    stat = Path(f"/proc/{pid}/stat")  # a process that has ended and that nobody has asked about is not running
+    return not (stat.exists() and stat.read_text().rpartition(")")[2].split()[0] == "Z")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs processes that can be killed")
+def test_workers_end_when_their_parent_is_killed(tmp_path):
+    program = (
+        "import sys\n"
+        "from test_sweeps import Engine, mark_and_wait, run_chunks\n"
+        "chunks = [(sys.argv[1], number) for number in range(4)]\n"
+        "run_chunks(mark_and_wait, chunks, Engine(backend='loky', workers=2), description={})\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([HERE, str(Path(HERE).parent)])}
+    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], env=environment) as parent:
+        pids = until(lambda: len(begun(tmp_path)) == 2 and [int(pid) for *_, pid in begun(tmp_path)], "two have begun")
+        assert all(is_running(pid) for pid in pids)
+        parent.kill()
+    until(lambda: not any(is_running(pid) for pid in pids), "the workers have ended")
+
+
+# Kills each process that a Dask cluster starts at once, and prints what the sweep says.
+STILLBORN = """
+import os, pathlib, signal, sys, threading, time
+from test_sweeps import Engine, SweepError, double, run_chunks
+
+def kill():
+    while True:
+        for stat in pathlib.Path("/proc").glob("[0-9]*/stat"):
+            try:
+                parent = int(stat.read_text().rpartition(")")[2].split()[1])
+                if parent == os.getpid() and b"spawn_main" in (stat.parent / "cmdline").read_bytes():
+                    os.kill(int(stat.parent.name), signal.SIGKILL)
+            except OSError:
+                pass
+        time.sleep(0.005)
+
+if __name__ == "__main__":
+    threading.Thread(target=kill, daemon=True).start()
+    try:
+        run_chunks(double, [[1.0]], Engine(backend="dask", workers=2), description={})
+    except SweepError as error:
+        print(error)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc to find the workers as they start")
+def test_dask_workers_killed_while_they_start_are_one_clear_error(tmp_path):
+    pytest.importorskip("distributed")
+    (tmp_path / "stillborn.py").write_text(STILLBORN)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([HERE, str(Path(HERE).parent)])}
+    words = [sys.executable, str(tmp_path / "stillborn.py")]
+    run = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, check=False, env=environment)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.startswith("a Dask cluster on this machine could not be started: ")
 
 
 # What cannot be -------------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from agents import evaluation, runs, training
 from scripts import evaluate as evaluate_script
 from scripts import train as train_script
-from sd_friction_env import ENVIRONMENT_IDS, Table
+from sd_friction_env import ENVIRONMENT_IDS, Table, storage
 from sd_friction_env.policies import load_policy
 from sd_friction_env.wrappers import ScaledReward
 
@@ -222,7 +222,7 @@ def test_a_run_that_was_stopped_is_never_taken_for_a_finished_one(tmp_path):
 
 def damage_config(folder, **changes):
     config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**config, **changes}))
+    storage.write_json(folder / "config.json", {**config, **changes})
 
 
 def test_damaged_folders_are_refused(copied, tmp_path):
@@ -250,14 +250,46 @@ def test_damaged_folders_are_refused(copied, tmp_path):
         (copied / "config.json").write_bytes(whole["config.json"])
 
 
+@pytest.mark.parametrize("damage", ["complex", "double", "NaN", "not tensors"])
+def test_weights_that_are_no_finite_numbers_of_their_type_are_refused(damage, copied):
+    weights = torch.load(copied / "policy.pt", weights_only=True)
+    change = {
+        "complex": lambda part: part.to(torch.complex64),
+        "double": lambda part: part.double(),
+        "NaN": lambda part: part * torch.nan,
+        "not tensors": lambda part: "x",
+    }[damage]
+    torch.save({name: change(part) for name, part in weights.items()}, copied / "policy.pt")
+    files = json.loads((copied / "config.json").read_text())["files"]
+    damage_config(copied, files=files | {"policy.pt": storage.file_digest(copied / "policy.pt")})
+    with pytest.raises(runs.RunFolderError, match="is damaged"):
+        runs.load_torch_policy(copied)
+
+
+def test_a_network_larger_than_its_weights_is_not_even_built(copied, monkeypatch):
+    monkeypatch.setattr(training, "build_policy", None)
+    kwargs = {"net_arch": [4096, 4096]}
+    damage_config(copied, hyperparameters={"policy_kwargs": kwargs})
+    with pytest.raises(runs.RunFolderError, match=r"policy\.pt does not fit config\.json: it has .* weights"):
+        runs.load_torch_policy(copied)
+
+
+@pytest.mark.parametrize("name", ["config.json", "evaluations.csv"])
+def test_a_file_of_a_run_edited_by_hand_or_taken_from_another_is_refused(name, copied):
+    text = (copied / name).read_text()
+    (copied / name).write_text(text.replace("128", "129"))
+    with pytest.raises(runs.RunFolderError, match=name.replace(".", r"\.")):
+        runs.load_network(copied)
+
+
 def test_weights_that_do_not_fit_are_refused(copied):
     config = json.loads((copied / "config.json").read_text())
     config["hyperparameters"]["policy_kwargs"]["net_arch"] = [32]
-    (copied / "config.json").write_text(json.dumps(config))
+    storage.write_json(copied / "config.json", config)
     with pytest.raises(runs.RunFolderError, match="does not fit"):
         runs.load_torch_policy(copied)
     config["hyperparameters"]["policy_kwargs"]["activation_fn"] = "os.system"
-    (copied / "config.json").write_text(json.dumps(config))
+    storage.write_json(copied / "config.json", config)
     with pytest.raises(runs.RunFolderError, match="activation_fn must be one of Tanh, ReLU"):
         runs.load_torch_policy(copied)
 
@@ -314,7 +346,7 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
     assert process.returncode == 130
     assert "interrupted" in errors
     assert "Traceback" not in errors
-    (last,) = checkpoints.glob("step_*.pt")
+    last = max(checkpoints.glob("step_*.pt"))
     assert str(last) in errors
     assert f"--run-folder {tmp_path / 'run'} --resume" in errors
     parameters = runs.load_tensors(last)["parameters"]
@@ -351,6 +383,12 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
         (["--env-arg", "w_effort=-1"], "w_effort must be a finite number in [0, 1e+06], got -1"),
         (["--env-arg", "colour=red"], "unexpected keyword argument 'colour'"),
         (["--hyperparameters", "gone.yml"], "cannot be read from 'gone.yml'"),
+        (["--hyperparameters", "/dev/zero"], "'/dev/zero' must be a file; it is a pipe or a device"),
+        (["--hyperparameters", str(ROOT)], "must be a file; it is a folder"),
+        (["--set", f"gamma={'9' * 5000}"], "a whole number of 5000 digits; at most 40 are read"),
+        (["--set", "gamma=" + "[" * 5000], "5,000 brackets lie in one another"),
+        (["--set", "gamma={a: &a [1], b: [*a, *a]}"], "gamma must be a number in [0, 1]"),
+        (["--set", "policy_kwargs=dict(net_arch=[8192, 8192])"], "net_arch must have at most 33,554,432 weights"),
     ],
 )
 def test_bad_arguments_are_one_line_and_status_2_before_anything_is_written(change, message, tmp_path, capsys):
@@ -393,6 +431,12 @@ def test_rl_zoo_trains_from_the_same_files(algorithm, tmp_path):
     what = ["--algo", algorithm, "--env", BELT, "--gym-packages", "sd_friction_env", "-n", "500", "-f", str(tmp_path)]
     file = ["--conf-file", str(training.HYPERPARAMETERS / f"{algorithm}.yml"), "--eval-freq", "-1", "--device", "cpu"]
     subprocess.run([sys.executable, "-m", "rl_zoo3.train", *what, *file], check=True, cwd=tmp_path, timeout=300)
+
+
+@pytest.mark.parametrize("value", [10**400, -(10**5000), 1j], ids=["large", "larger", "complex"])
+def test_numbers_beyond_floating_point_are_refused_by_name(value):
+    with pytest.raises((TypeError, ValueError), match=r"gamma must be a number in \[0, 1\], got "):
+        training.check_hyperparameters("ppo", {"gamma": value})
 
 
 @pytest.mark.parametrize(

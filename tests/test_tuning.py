@@ -437,3 +437,21 @@ def test_files_of_others_are_left_alone(storage, tmp_path, capsys):
         assert said in errors
     assert mine.read_text() == "precious: 1\n"
     assert (tmp_path / "study.db").read_text() == "no database, " * 100
+
+
+@pytest.mark.parametrize("what", ["hyperparameters", "best", "value"])
+def test_a_trial_changed_since_it_ended_is_refused_by_name(what, storage, monkeypatch):
+    scripted(monkeypatch, [-100.0, -50.0], [-80.0, -70.0])
+    search = tiny_search()
+    study_of(search, storage, 2)
+    with sqlite3.connect(storage.removeprefix("sqlite:///")) as database:
+        if what == "value":
+            changed = database.execute("UPDATE trial_values SET value = value + 1 WHERE trial_id = 2")
+        else:
+            where = "WHERE key = ? AND trial_id = 2"
+            edited = "UPDATE trial_user_attributes SET value_json = replace(value_json, '0', '1') "
+            changed = database.execute(edited + where, (what,))
+        assert changed.rowcount == 1
+    database.close()
+    with pytest.raises(tuning.StudyError, match="trial 1 of study 'study' is damaged, or changed since it ended"):
+        tuning.open_study(search, storage, "study")

@@ -3489,12 +3489,13 @@ def own_cycle_starts(state, integers, which, phases, beyond):
     are left alone."""
     left = np.zeros(len(which), dtype=np.uint8)
     exits = np.empty(SETTLING_EXITS)
+    no_traps = np.empty((0, TRAP_ROW))
     for j in range(len(which)):
         i = which[j]
         speed = state[S_BELT_SPEED, i]
         plant = calm(_plant_of(state, integers, i, 0.0, beyond))
         left[j] = 1
-        outcome, x, _, _ = settle(plant, speed, 0.0, speed, SETTLING_LAPS, exits)
+        outcome, x, _, _ = settle(plant, speed, 0.0, speed, SETTLING_LAPS, exits, no_traps)
         if outcome != REPEATED_BREAKAWAY:
             continue
         lap = stick_slip_lap(plant, speed, x)

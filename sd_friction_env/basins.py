@@ -27,7 +27,7 @@ from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checke
 LOST_CONTACT, UNDECIDED = -1, -2
 
 _STARTS_WORTH_A_THREAD = 20_000
-_SAMPLED_MAXIMA = 15  # among those with which motions leave a range of radii
+_SAMPLED_MAXIMA = (15, 240)  # first few, then many, among those with which motions leave a range of radii
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,9 +113,14 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
 
     def label_from(low: float, high: float) -> int:
         """Return the label of all maxima between two places, UNDECIDED if they have not one."""
-        reached = np.empty(_SAMPLED_MAXIMA, dtype=np.int8)
-        classify(np.linspace(low, high, _SAMPLED_MAXIMA + 2)[1:-1], np.zeros(_SAMPLED_MAXIMA), reached)
-        return int(reached[0]) if (reached == reached[0]).all() else UNDECIDED
+        label = UNDECIDED
+        for count in _SAMPLED_MAXIMA:
+            reached = np.empty(count, dtype=np.int8)
+            classify(np.linspace(low, high, count + 2)[1:-1], np.zeros(count), reached)
+            if (reached == UNDECIDED).any() or (reached != (reached[0] if label == UNDECIDED else label)).any():
+                return UNDECIDED
+            label = int(reached[0])
+        return label
 
     # Where all maxima drift out of a range of radii, what follows is known as soon as that of its neighbours is.
     for _ in range(width):

@@ -701,8 +701,10 @@ def limits_of_slip(parameters: OscillatorParameters) -> list[tuple[float, list[S
             orbits = [_pure_slip(parameters, centre + radius, centre + radius, 0.0) for radius in part.cycles]
             steady = _steady(parameters, "steady-slip", centre, centre, 0.0)
             # A range's first radius and its last are fixed points only where the first is the equilibrium.
-            inmost = SlipLimit(high, *((steady, None) if low == 0.0 else (None, (part.after[0], low))))
-            outmost = SlipLimit(high, None, (high, part.after[1]))
+            inmost = SlipLimit(
+                high, *((steady, None) if low == 0.0 else (None, (part.after[0], min(low, part.after[1]))))
+            )
+            outmost = SlipLimit(high, None, (max(high, part.after[0]), part.after[1]))
             marks = [inmost, *(SlipLimit(high, orbit) for orbit in orbits), outmost]
             for radius, tendency, (inner, outer) in zip(
                 (*part.cycles, high), part.tendencies, itertools.pairwise(marks), strict=True

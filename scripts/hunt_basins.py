@@ -22,7 +22,6 @@ from sd_friction_env.orbits import equilibria, stick_intervals
 
 STARTS_OF_A_PLANT = 12
 SAME = 1e-5  # extremes of x, relative to the motion's size
-CHANGED = 1e-3
 STILL = 1e-9
 BUDGET = 3e5  # integration steps of a direct run
 
@@ -77,7 +76,7 @@ def stiffest(p: OscillatorParameters, x: float, v: float) -> float:
     """Return a rate that bounds the step of an explicit integration about a state."""
     speeds = (abs(v) + p.belt_speed, p.belt_speed, 1e-6)
     slope = max(abs(kernel.friction_slope(p.plant, -1, -w)) for w in speeds)
-    return max(15.0, 2.0 * p.beta + max(p.normal_force(x), p.normal_force(0.5 * x), p.g1) * slope)
+    return float(max(15.0, 2.0 * p.beta + max(p.normal_force(x), p.normal_force(0.5 * x), p.g1) * slope))
 
 
 def follow(p: OscillatorParameters, x: float, v: float, found: Basins, label: int) -> Verdict:
@@ -115,17 +114,13 @@ def follow(p: OscillatorParameters, x: float, v: float, found: Basins, label: in
         if close is not None and close == near:
             return Verdict("held" if close == label else "wrong", f"reaches {close}")
         near = close
-        if spent > BUDGET or (change < STILL and close is None):
+        inside = label >= 0 and found.attractors[label].kind == "neutral" and change < STILL
+        if inside:
+            family = found.attractors[label]
+            inside = family.x_min - SAME * size <= low and high <= family.x_max + SAME * size
+        if inside or spent > BUDGET:
             here = f"{low:.9g} to {high:.9g} after {duration:.3g}, changed by {change:.2g}"
-            if change < 100.0 * SAME * 1e-3 and (
-                not order or distances[order[0]] > CHANGED or found.attractors[order[0]].kind == "neutral"
-            ):
-                neutral = label >= 0 and found.attractors[label].kind == "neutral"
-                if neutral:
-                    a = found.attractors[label]
-                    neutral = a.x_min - SAME * size <= low and high <= a.x_max + SAME * size
-                return Verdict("held" if neutral else "wrong", f"keeps {here}")
-            return Verdict("not settled", here)
+            return Verdict("held" if inside else "wrong" if change < STILL and close is None else "not settled", here)
         duration *= 2.0
 
 

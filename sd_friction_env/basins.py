@@ -1,8 +1,10 @@
 """Which attractor a start reaches: starts by the million, fractions of them, and grids to draw."""
 
+import functools
 import itertools
 import math
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -26,8 +28,10 @@ from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checke
 
 LOST_CONTACT, UNDECIDED = -1, -2
 
+_Classify = Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.int8]], None]
+
 _STARTS_WORTH_A_THREAD = 20_000
-_SAMPLED_MAXIMA = 15  # among those with which motions leave a range of radii
+_SAMPLED_MAXIMA = (3, 16, 240)  # first few, then many, among those with which motions leave a range of radii
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,7 +75,28 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
             raise ValueError(f"{name} must hold at least one start, got shape {values.shape}")
         worst = values.flat[int(np.argmax(np.where(np.isfinite(values), np.abs(values), np.inf)))]
         checked_number(name, float(worst), -STATE_LIMIT, STATE_LIMIT)
-    found = list(attractors(parameters))
+    found, classify = _classifier(parameters)
+    labels = np.empty(xs.size, dtype=np.int8)
+    flat_x, flat_v = np.ascontiguousarray(xs).ravel(), np.ascontiguousarray(vs).ravel()
+
+    def classify_part(part: slice) -> None:
+        classify(flat_x[part], flat_v[part], labels[part])
+
+    # Starts do not know of each other: any number of threads gives the same labels. Few starts are not worth one.
+    threads = min(threads or os.cpu_count() or 1, xs.size // _STARTS_WORTH_A_THREAD)
+    if threads < 2:
+        classify_part(slice(None))
+    else:
+        edges = np.linspace(0, xs.size, 8 * threads + 1).astype(int).tolist()
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(classify_part, itertools.starmap(slice, itertools.pairwise(edges))))
+    return Basins(attractors=found, labels=labels.reshape(xs.shape), parameters=parameters)
+
+
+@functools.lru_cache(maxsize=16)
+def _classifier(parameters: OscillatorParameters) -> tuple[tuple[LimitCycle, ...], _Classify]:
+    """Return the attractors, and the function that writes which of them the starts (x, v), (n,) each, reach."""
+    found = tuple(attractors(parameters))
 
     def label_of(cycle: LimitCycle | None) -> int:
         alike = (i for i, known in enumerate(found) if cycle is not None and same_motion(cycle, known))
@@ -96,8 +121,6 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
     for i, rows in limits.items():
         bounds[i, : len(rows)] = [row.radius for row in rows]
         bound_labels[i, : len(rows)] = [label_of(row.cycle) for row in rows]
-    labels = np.empty(xs.size, dtype=np.int8)
-    flat_x, flat_v = np.ascontiguousarray(xs).ravel(), np.ascontiguousarray(vs).ravel()
     known = (
         np.array(exits, dtype=np.float64),
         np.array(exit_labels, dtype=np.int64),
@@ -113,9 +136,14 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
 
     def label_from(low: float, high: float) -> int:
         """Return the label of all maxima between two places, UNDECIDED if they have not one."""
-        reached = np.empty(_SAMPLED_MAXIMA, dtype=np.int8)
-        classify(np.linspace(low, high, _SAMPLED_MAXIMA + 2)[1:-1], np.zeros(_SAMPLED_MAXIMA), reached)
-        return int(reached[0]) if (reached == reached[0]).all() else UNDECIDED
+        label = UNDECIDED
+        for count in _SAMPLED_MAXIMA:
+            reached = np.empty(count, dtype=np.int8)
+            classify(np.linspace(low, high, count + 2)[1:-1], np.zeros(count), reached)
+            if (reached == UNDECIDED).any() or (reached != (reached[0] if label == UNDECIDED else label)).any():
+                return UNDECIDED
+            label = int(reached[0])
+        return label
 
     # Where all maxima drift out of a range of radii, what follows is known as soon as that of its neighbours is.
     for _ in range(width):
@@ -127,19 +155,7 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
                     bound_labels[i, j] = label_from(places[i] + low, places[i] + high)
         if np.array_equal(bound_labels, before):
             break
-
-    def classify_part(part: slice) -> None:
-        classify(flat_x[part], flat_v[part], labels[part])
-
-    # Starts do not know of each other: any number of threads gives the same labels. Few starts are not worth one.
-    threads = min(threads or os.cpu_count() or 1, xs.size // _STARTS_WORTH_A_THREAD)
-    if threads < 2:
-        classify_part(slice(None))
-    else:
-        edges = np.linspace(0, xs.size, 8 * threads + 1).astype(int).tolist()
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(classify_part, itertools.starmap(slice, itertools.pairwise(edges))))
-    return Basins(attractors=tuple(found), labels=labels.reshape(xs.shape), parameters=parameters)
+    return found, classify
 
 
 def basin_grid(

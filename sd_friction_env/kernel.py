@@ -1628,10 +1628,10 @@ SAME_PLACE = 1e-9  # breakaway points closer than this are one
 STICK_PATIENCE = 1e12  # a belt this slow never brings a stuck mass to breakaway
 # Slip that takes longer from one turning point or landing to the next passes a fold, and is not decided.
 SLIP_PATIENCE = 2000.0
-CREEP_PIECE = 30.0  # of slip, after which it is seen whether it creeps into a node
+FIRST_PIECE, CREEP_PIECE = 1e-3, 30.0  # of slip, after which it is seen whether it creeps into a node
 STEPS_OF_A_PIECE, MOST_PIECES = 3e4, 400
 SETTLING_LAPS, SETTLING_EXITS = 8, 64  # before a passive motion that still slips is looked at more closely
-MOST_TURNINGS = 2000  # of one start, in `classify`
+MOST_TURNINGS = 6000  # of one start, in `classify`
 TRAP_POINTS, TRAP_REFINEMENTS = 600, 5  # distances from a node at which its trap is seen to hold, and finer ones
 
 # A row of `traps` says which states certainly tend to a stable equilibrium.
@@ -1698,10 +1698,12 @@ def slip_to_section(plant, mode, x, v, v_belt, traps):
     integral of v^2."""
     t = 0.0
     int_v2 = 0.0
-    patience = SLIP_PATIENCE
+    longest = SLIP_PATIENCE
     for i in range(len(traps)):
         if traps[i, TRAP_SLOPE] > 0.0:
-            patience = CREEP_PIECE
+            longest = CREEP_PIECE
+    # What creeps into a node may grow stiff on the way: the first pieces are short.
+    patience = longest if longest == SLIP_PATIENCE else FIRST_PIECE
     for _ in range(MOST_PIECES):
         trap = trap_of(traps, mode, x, v)
         if trap >= 0:
@@ -1711,6 +1713,7 @@ def slip_to_section(plant, mode, x, v, v_belt, traps):
         dt, x, v, event, dv2, _, _, _ = slip_across(plant, mode, x, v, v_belt, 0.0, 0.0, piece, True)
         t += dt
         int_v2 += dv2
+        patience = min(2.0 * patience, longest)
         if event != NO_EVENT:
             return t, x, v, event, -1, int_v2
         if t >= SLIP_PATIENCE:

@@ -25,6 +25,7 @@ from sd_friction_env.theory import FloatArray, cubic_wells, exact_wells
 Kind = Literal["stick-slip", "pure-slip", "steady-slip", "neutral", "rest"]
 
 _LONG_SETTLING_LAPS = 800
+_STILL_SHARE = 0.01
 _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are called the equilibrium
 _FINEST_RATIO = 1.15  # of neighbouring radii at which a return map is sampled
 _LAP_ERROR = 1e-13  # of a return map, relative to max(1, |x|): what is less is rounding
@@ -62,6 +63,11 @@ class Equilibrium:
     def damping(self) -> float:
         """Of small deviations, minus the sum of the eigenvalues."""
         return -(self.eigenvalues[0] + self.eigenvalues[1]).real
+
+    @property
+    def weak(self) -> bool:
+        """Whether damping is lost in rounding, so that it decides nothing."""
+        return abs(self.damping) <= 1e-13 * max(abs(value) for value in self.eigenvalues)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,7 +265,7 @@ def traps_of(parameters: OscillatorParameters) -> FloatArray:
     plant, rows = parameters.plant, []
     for e in equilibria(parameters):
         centre = is_centre(parameters, e)
-        stable = centre and e.damping > 0.0
+        stable = centre and e.damping > 0.0 and not e.weak
         if not stable and not (centre and conserves_energy(parameters)):
             continue
         ball, level = ball_of(e), e.stiffness <= _LEVEL
@@ -334,7 +340,7 @@ def limit_of_motion(parameters: OscillatorParameters, x: float, v: float) -> Lim
             return _steady(parameters, "neutral" if conserved else "steady-slip", place, x, v)
         if outcome == kernel.ORBIT_UNDECIDED:
             break
-        if conserved and _is_neutral(parameters, place):
+        if _is_neutral(parameters, place):
             return _pure_slip(parameters, place, x, v, "neutral")
         around = [e for e in equilibria(parameters) if lowest <= e.x <= place]
         repeats = abs(place - previous) < kernel.TIME_ZERO and place - lowest > _SMALLEST_RADIUS
@@ -360,10 +366,14 @@ def _is_frictionless(parameters: OscillatorParameters) -> bool:
 
 
 def _is_neutral(parameters: OscillatorParameters, x_max: float) -> bool:
-    """Whether a lap from a maximum of x neither loses nor gains energy, where slip on one side does not."""
-    plant, speed = parameters.plant, parameters.belt_speed
-    event, *_, forward_arcs = kernel.next_maximum(plant, speed, x_max, traps_of(parameters))
-    return bool(event == kernel.TURNING and (forward_arcs == 0 or _is_frictionless(parameters)))
+    """Whether a maximum of x is of a neutral orbit."""
+    if not (conserves_energy(parameters) or any(e.weak for e in equilibria(parameters))):
+        return False
+    left = [(centre, limits) for centre, limits in limits_of_slip(parameters) if centre < x_max]
+    for limit in left[-1][1] if left else ():
+        if x_max - left[-1][0] < limit.radius:
+            return limit.cycle is not None and limit.cycle.kind == "neutral"
+    return False
 
 
 def root(function: Callable[[float], float], low: float, high: float) -> float:
@@ -394,6 +404,7 @@ class LapRange:
         cycles: its fixed points between, ascending.
         tendencies: of the maxima between one of these radii and the next: 1 outwards, -1 inwards, 0 not resolved.
         kind: of its laps.
+        neutral: whether every lap closes, but for rounding.
     """
 
     ends: tuple[float, float]
@@ -401,6 +412,7 @@ class LapRange:
     cycles: tuple[float, ...]
     tendencies: tuple[int, ...]
     kind: LapKind
+    neutral: bool = False
 
 
 class ReturnMap:
@@ -530,12 +542,22 @@ class ReturnMap:
         ends, after = (low, high), (low + inside[0][1], high + inside[-1][1])
         if conserves_energy(self.parameters) or _slip_dissipates(self.parameters):
             neutral = conserves_energy(self.parameters) and (kind[1] == 0 or _is_frictionless(self.parameters))
-            return [LapRange(ends=ends, after=after, cycles=(), tendencies=(0 if neutral else -1,), kind=kind)]
+            tendency = 0 if neutral else -1
+            return [LapRange(ends=ends, after=after, cycles=(), tendencies=(tendency,), kind=kind, neutral=neutral)]
         known = [(radius, shift) for radius, shift in inside if self.resolved(radius, shift)]
+        if low == 0.0 and self.equilibrium.weak:
+            begin = known[0][0] if known else math.inf
+            still = max((radius for radius, _ in inside if radius < begin), default=0.0)
+            if still > _STILL_SHARE * high:  # too many for a curvature to decide: friction so level that none moves
+                core = LapRange(
+                    ends=(low, still), after=(low, still), cycles=(), tendencies=(0,), kind=kind, neutral=True
+                )
+                rest = [lap for lap in inside if lap[0] >= still]
+                return [core, *(self.parted(kind, still, rest) if len(rest) > 1 else [])]
         try:
             cycles = self.cycles(kind, known)
             first = 0
-            if low == 0.0 and not self.is_weak:
+            if low == 0.0 and not self.equilibrium.weak:
                 # The equilibrium is a fixed point too: its linearisation says what rounding hides of small orbits.
                 first = -1 if self.equilibrium.damping > 0.0 else 1
                 if known and known[0][1] * first < 0.0:
@@ -557,11 +579,6 @@ class ReturnMap:
         if tendencies[0] == 0:
             tendencies[0] = first
         return [LapRange(ends=ends, after=after, cycles=tuple(cycles), tendencies=tuple(tendencies), kind=kind)]
-
-    @property
-    def is_weak(self) -> bool:
-        """Whether the equilibrium's linearisation is neutral, so that its curvature decides."""
-        return abs(self.equilibrium.damping) <= 1e-13 * max(abs(value) for value in self.equilibrium.eigenvalues)
 
     def cycles(self, kind: LapKind | None, known: list[tuple[float, float]]) -> list[float]:
         """Return the radii of cycles among samples (radius, shift) of one kind of lap.
@@ -603,7 +620,7 @@ def sections(parameters: OscillatorParameters) -> list[Section]:
         laps = ReturnMap(parameters, equilibrium)
         ranges = laps.ranges()
         attracts = equilibrium.damping > 0.0
-        if laps.is_weak:
+        if equilibrium.weak:
             attracts = bool(ranges) and ranges[0].ends[0] == 0.0 and ranges[0].tendencies[0] < 0
         found.append(Section(equilibrium, attracts, ranges))
     return found
@@ -633,7 +650,7 @@ def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: lis
         return "on", maximum
     if not laps.resolved(radius, shift):
         # Of small orbits, lost in rounding, the equilibrium's linearisation says what they do, or greater ones.
-        shift = -around[-1].damping if not laps.is_weak else laps.first_resolved(radius, kind)
+        shift = laps.first_resolved(radius, kind) if around[-1].weak else -around[-1].damping
     contracts = _slip_dissipates(parameters)
     growing = shift > 0.0 and not contracts
     factor = 1.2 if growing else 0.5
@@ -693,7 +710,7 @@ def limits_of_slip(parameters: OscillatorParameters) -> list[tuple[float, list[S
             low, high = part.ends
             if low > 0.0:
                 limits.append(SlipLimit(low))
-            if conserves_energy(parameters) and part.tendencies == (0,):
+            if part.neutral:
                 # A little inside: on the very edge, where the orbit touches the belt's speed, rounding decides.
                 place = centre + high - 1e-9 * (high - low)
                 limits.append(SlipLimit(high, _pure_slip(parameters, place, place, 0.0, "neutral")))
@@ -701,8 +718,10 @@ def limits_of_slip(parameters: OscillatorParameters) -> list[tuple[float, list[S
             orbits = [_pure_slip(parameters, centre + radius, centre + radius, 0.0) for radius in part.cycles]
             steady = _steady(parameters, "steady-slip", centre, centre, 0.0)
             # A range's first radius and its last are fixed points only where the first is the equilibrium.
-            inmost = SlipLimit(high, *((steady, None) if low == 0.0 else (None, (part.after[0], low))))
-            outmost = SlipLimit(high, None, (high, part.after[1]))
+            inmost = SlipLimit(
+                high, *((steady, None) if low == 0.0 else (None, (part.after[0], min(low, part.after[1]))))
+            )
+            outmost = SlipLimit(high, None, (max(high, part.after[0]), part.after[1]))
             marks = [inmost, *(SlipLimit(high, orbit) for orbit in orbits), outmost]
             for radius, tendency, (inner, outer) in zip(
                 (*part.cycles, high), part.tendencies, itertools.pairwise(marks), strict=True

@@ -970,6 +970,9 @@ class Counted:
     def __neg__(self) -> "Counted":
         return self.operations.known("negative", self.place)[0]  # a change of sign costs next to nothing
 
+    def __lt__(self, other: Any) -> bool:
+        return True  # as of the numbers that a step accepts; a comparison is no arithmetic
+
     def sqrt(self) -> "Counted":
         """Return the square root."""
         return self.operations.done("square root", "sqrt", self)
@@ -985,7 +988,7 @@ def count_operations(function: Callable[..., Any], names: Sequence[str]) -> Oper
 def slip_step_operations() -> Operations:
     """Count the operations of one slip step. Only where numba compiles nothing (NUMBA_DISABLE_JIT=1)."""
     law: Any = kernel
-    law.math = types.SimpleNamespace(sqrt=Counted.sqrt)
+    law.math = types.SimpleNamespace(sqrt=Counted.sqrt, inf=math.inf)
 
     def step(alpha: Any, g1: Any, beta: Any, mu_s: Any, k1: Any, k3: Any, *rest: Any) -> Any:
         return law._slip_step(kernel.Plant(kernel.EXACT, alpha, g1, beta, mu_s, k1, k3), *rest)

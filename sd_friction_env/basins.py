@@ -145,14 +145,16 @@ def _classifier(parameters: OscillatorParameters) -> tuple[tuple[LimitCycle, ...
             label = int(reached[0])
         return label
 
-    # Where all maxima drift out of a range of radii, what follows is known as soon as that of its neighbours is.
+    # Where all maxima drift out of a range of radii, what follows is known as soon as that of its neighbours is: those
+    # that drift outwards are looked at from outside, the others from inside.
+    leaving = [(i, j, row.leaves) for i, rows in limits.items() for j, row in enumerate(rows) if row.leaves is not None]
+    outwards = [(i, j, leaves) for i, j, leaves in leaving if leaves[0] >= bounds[i, j]]
+    order = [*reversed(outwards), *(entry for entry in leaving if entry not in outwards)]
     for _ in range(width):
         before = bound_labels.copy()
-        for i, rows in limits.items():
-            for j, row in enumerate(rows):
-                if row.leaves is not None and bound_labels[i, j] == UNDECIDED:
-                    low, high = row.leaves
-                    bound_labels[i, j] = label_from(places[i] + low, places[i] + high)
+        for i, j, (low, high) in order:
+            if bound_labels[i, j] == UNDECIDED:
+                bound_labels[i, j] = label_from(places[i] + low, places[i] + high)
         if np.array_equal(bound_labels, before):
             break
     return found, classify

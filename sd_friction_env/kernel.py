@@ -1631,7 +1631,7 @@ SLIP_PATIENCE = 2000.0
 FIRST_PIECE, CREEP_PIECE = 1e-3, 30.0  # of slip, after which it is seen whether it creeps into a node
 STEPS_OF_A_PIECE, MOST_PIECES = 3e4, 400
 SETTLING_LAPS, SETTLING_EXITS = 8, 64  # before a passive motion that still slips is looked at more closely
-MOST_TURNINGS = 6000  # of one start, in `classify`
+MOST_TURNINGS = 20_000  # of one start, in `classify`
 TRAP_POINTS, TRAP_REFINEMENTS = 600, 5  # distances from a node at which its trap is seen to hold, and finer ones
 
 # A row of `traps` says which states certainly tend to a stable equilibrium.

@@ -28,6 +28,7 @@ _LONG_SETTLING_LAPS = 800
 _STILL_SHARE = 0.01
 _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are called the equilibrium
 _FINEST_RATIO = 1.15  # of neighbouring radii at which a return map is sampled
+_SAMPLES_OF_A_GAP = (15, 7)
 _LAP_ERROR = 1e-13  # of a return map, relative to max(1, |x|): what is less is rounding
 _MOST_SETTLINGS, _MOST_LAPS = 200, 2000
 _LEVEL, _LEVEL_STEP = 1e-9, 1e-4  # where a spring's stiffness is less, the force this far away says more
@@ -415,6 +416,10 @@ class LapRange:
     neutral: bool = False
 
 
+def _radius(lap: tuple[float, LapKind | None, float]) -> float:
+    return lap[0]
+
+
 class ReturnMap:
     """The map from one maximum of x to the next in slip, by the radius: the distance of the maximum from a centre.
 
@@ -505,7 +510,15 @@ class ReturnMap:
         if math.isfinite(self.farthest):
             edge = self.farthest * (1.0 - np.geomspace(1e-6, 0.1, 12))
             fine = sorted(radius for radius in {*fine, *edge.tolist()} if 0.0 < radius < self.farthest)
-        return [(radius, *self.lap(radius)) for radius in fine if radius > 1.5 * ball_of(self.equilibrium)]
+        found = [(radius, *self.lap(radius)) for radius in fine if radius > 1.5 * ball_of(self.equilibrium)]
+        for count in _SAMPLES_OF_A_GAP:  # where the kind of lap changes there may be laps of a third kind between
+            between = [
+                np.linspace(low[0], high[0], count + 2)[1:-1].tolist()
+                for low, high in itertools.pairwise(found)
+                if low[1] != high[1]
+            ]
+            found = sorted([*found, *((radius, *self.lap(radius)) for part in between for radius in part)], key=_radius)
+        return found
 
     def ranges(self) -> list[LapRange]:
         """Return where the map is continuous, with its cycles, ascending.

@@ -121,7 +121,10 @@ def attractor_curves(
         places = [e.x for e in equilibria(plant)]
         rows += [_row(cycle) | {"well": _well(cycle, places)} for cycle in found]
         if not found:
-            rows.append(_failed_row(speed, float("nan"), float("nan"), "no attractor keeps contact") | {"well": ""})
+            rows.append(
+                _failed_row(speed, float("nan"), float("nan"), "no attractor that keeps contact was found")
+                | {"well": ""}
+            )
         if progress is not None:
             progress(done, len(speeds))
     return _table(rows, parameters)

@@ -30,6 +30,7 @@ _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are cal
 _FINEST_RATIO = 1.15  # of neighbouring radii at which a return map is sampled
 _SAMPLES_OF_A_GAP = (15, 7)
 _LAP_ERROR = 1e-13  # of a return map, relative to max(1, |x|): what is less is rounding
+_LARGEST_SMALL = 1e-2  # radius about an equilibrium up to which its Hopf normal form holds
 _MOST_SETTLINGS, _MOST_LAPS = 200, 2000
 _LEVEL, _LEVEL_STEP = 1e-9, 1e-4  # where a spring's stiffness is less, the force this far away says more
 _BELT_SPEED_ERROR = 1e-11  # v_b0 is given this much too low: on the very graze rounding decides whether a cycle sticks
@@ -480,6 +481,21 @@ class ReturnMap:
         """Whether a shift is more than rounding."""
         return abs(shift) > _LAP_ERROR * max(1.0, abs(self.centre + radius))
 
+    def small_cycle(self, radius: float, kind: LapKind | None) -> float:
+        """Return the radius of a cycle so small that what a lap does to it is lost in rounding.
+
+        Near a Hopf point a lap changes a radius r by r (a - b r^2); a is known from the linearisation, and b from an
+        orbit, from ``radius`` outwards, that is large enough.
+        """
+        e = self.equilibrium
+        a = math.expm1(-math.pi * e.damping / math.sqrt(max(e.stiffness - 0.25 * e.damping**2, 1e-300)))
+        shift = self.shift(radius, kind)
+        while not self.resolved(radius, 1e-3 * shift) and radius < _LARGEST_SMALL:
+            radius *= 2.0
+            shift = self.shift(radius, kind)
+        ratio = a / (a - shift / radius)
+        return radius * math.sqrt(ratio) if 0.0 < ratio < 1.0 else radius
+
     def leaving(self, radius: float, kind: LapKind) -> float | None:
         """Return the first radius without a lap of this kind that follows on one, None after too many laps."""
         for _ in range(_MOST_LAPS):
@@ -677,6 +693,8 @@ def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: lis
                 change = laps.shift(following, kind)
             if (change > 0.0) == growing or contracts or not laps.resolved(following, change):
                 break
+            if not laps.resolved(radius, laps.shift(radius, kind)):
+                return "pure-slip", centre + laps.small_cycle(following, kind)
             try:
                 return "pure-slip", centre + laps.root(kind, radius, following)
             except _NoLapError as gap:
@@ -686,7 +704,13 @@ def _limit_of_slip(parameters: OscillatorParameters, maximum: float, around: lis
             # With several wells it matters where the motion itself passes the edge.
             return "on", centre + (laps.leaving(first, kind) or beyond if len(laps.places) > 1 else beyond)
         radius = following
-    return ("on", centre + radius) if growing else ("steady-slip", centre)
+    if growing:
+        return "on", centre + radius
+    if (
+        around[-1].damping < 0.0 and not contracts
+    ):  # the equilibrium repels, so that a cycle is there that is too small to see
+        return "pure-slip", centre + laps.small_cycle(radius, kind)
+    return "steady-slip", centre
 
 
 def slip_cycles(parameters: OscillatorParameters) -> list[LimitCycle]:

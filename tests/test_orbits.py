@@ -288,3 +288,15 @@ def test_the_multiplier_is_one_sided_where_the_orbit_just_above_touches_the_belt
     at, beyond = (limit_cycle(parameters.replace(belt_speed=speed)) for speed in (graze + 1e-9, graze + 2e-3))
     assert at.kind == beyond.kind == "pure-slip"
     assert at.floquet_multiplier == pytest.approx(beyond.floquet_multiplier, abs=0.03)
+
+
+@pytest.mark.parametrize("below", [1e-12, 1e-10, 1e-9, 1e-8, 1e-6])
+@pytest.mark.parametrize("start", [(0.15, None), (0.1, 0.0)])
+def test_a_cycle_too_small_for_a_lap_to_be_told_from_rounding_has_the_amplitude_of_theory(below, start):
+    # Thomsen and Fidlin (2003): A = 2 sqrt(v_b1^2 - v_b^2) to first order.
+    plant = OscillatorParameters(geometry="linear")
+    v_b1 = critical_belt_speeds(plant).v_b1
+    cycle = limit_cycle(plant.replace(belt_speed=v_b1 - below), *start)
+    assert cycle.kind == "pure-slip"
+    assert cycle.amplitude == pytest.approx(2.0 * math.sqrt(v_b1**2 - (v_b1 - below) ** 2), rel=3e-4)
+    assert limit_cycle(plant.replace(belt_speed=v_b1 + 1e-9), *start).kind == "steady-slip"

@@ -14,11 +14,29 @@ import sys
 import time
 from collections import Counter
 
-from scripts.hunting import events, steps
+from scripts.hunting import against_scipy, environments, events, fuzz, motions, slow, steps
 from scripts.hunting.trials import Check, Failure, Findings, Interrupted, SetAside, hunt
 
-CHECKS = {check.name: check for check in (steps.CHECK, events.CHECK)}
-_SHOWN = 20  # failures of each check
+CHECKS = {
+    check.name: check
+    for check in (
+        steps.CHECK,
+        slow.CHECK,
+        against_scipy.CHECK,
+        events.CHECK,
+        environments.BATCHES,
+        environments.INTERPRETED_CHECK,
+        environments.INFOS,
+        motions.ATTRACTORS,
+        motions.MULTIPLIERS,
+        motions.LABELS,
+        motions.FILES,
+        fuzz.LEGAL,
+        fuzz.ARGUMENTS,
+        fuzz.COMMANDS,
+    )
+}
+_SHOWN = 5  # failures of each kind
 _MOST_SLOW = 20  # trials that had to be ended, before a check is left
 
 
@@ -74,14 +92,18 @@ def tell(check: Check, seed: int, findings: Findings, seconds: float) -> None:
         print(f"  set aside: {count} ({reason})")
     for name, (value, index) in findings.greatest.items():
         print(f"  {name}: {value:.3g} ({check.name}-{seed}-{index})")
-    kinds = Counter(words.split("]")[0].lstrip("[") for words in failures.values())
-    for kind, count in kinds.most_common():
+    for kind, count in Counter(map(kind_of, failures.values())).most_common():
         print(f"  failed: {count} ({kind})")
-    for index, words in sorted(failures.items())[:_SHOWN]:
-        print(f"  FAILED {check.name}-{seed}-{index}: {words}")
-    if len(failures) > _SHOWN:
-        print(f"  and {len(failures) - _SHOWN} more")
+        for index, words in [entry for entry in sorted(failures.items()) if kind_of(entry[1]) == kind][:_SHOWN]:
+            print(f"    FAILED {check.name}-{seed}-{index}: {words}")
+        if count > _SHOWN:
+            print(f"    and {count - _SHOWN} more")
     sys.stdout.flush()
+
+
+def kind_of(words: str) -> str:
+    """Return the kind of a failure, the part of its words in brackets."""
+    return words[1 : words.index("]")]
 
 
 def replay(name: str) -> int:
@@ -90,13 +112,16 @@ def replay(name: str) -> int:
     if check not in CHECKS or not (seed.isdigit() and index.isdigit()):
         print(f"--replay must be CHECK-SEED-INDEX with a check of {', '.join(CHECKS)}, got {name!r}", file=sys.stderr)
         return 2
-    CHECKS[check].prepare()
+    chosen = CHECKS[check]
+    if chosen.drawn is not None:
+        print(chosen.drawn(int(seed), int(index)), flush=True)
+    chosen.prepare()
     try:
-        numbers = CHECKS[check].trial(int(seed), int(index))
+        numbers = chosen.trial(int(seed), int(index))
     except SetAside as reason:
         print(f"set aside: {reason}")
     except Failure as found:
-        print(f"FAILED: {found}")
+        print("\n".join([f"FAILED: {found}", *getattr(found, "__notes__", [])]))
         return 1
     else:
         print(f"held {dict(numbers or {})}")

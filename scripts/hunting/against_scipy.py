@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from scipy.integrate import DOP853, Radau
 
 import tests.oracle as oracle
 from sd_friction_env import OscillatorParameters, kernel
-from scripts.hunting import draws, steps
+from scripts.hunting import steps
 from scripts.hunting.draws import Start
 from scripts.hunting.steps import INTERVAL, STATUS, V, X
 from scripts.hunting.trials import Check, Failure, SetAside
@@ -70,25 +69,22 @@ def trial(seed: int, index: int) -> Mapping[str, float]:
     words = f"x, v = {x:.12g}, {v:.12g} ({kernel.STATUS_NAMES[int(row[STATUS])]}); "
     words += f"SciPy has {wanted.x:.12g}, {wanted.v:.12g} ({'contact lost' if wanted.contact_lost else 'ok'})"
     found = Failure(steps.grade("scipy", gap), f"{words}; a start moved by 1 moves the end by {grows:.3g}")
-    found.add_note(f"{draws.described(p)}, {at}")
+    found.add_note(steps.described(seed, index))
     raise found
 
 
 def prepare() -> None:
     """Compile what the trials call."""
     steps.prepare()
-    p, at = steps.drawn(0, 0)
-    answer(OscillatorParameters(), at)
-    del p
 
 
-CHECK: Check = Check(
+CHECK = Check(
     "scipy",
     f"single steps against SciPy (rtol {oracle.RTOL:g}): gaps of x and v, relative, under {GAP:g}",
     trial,
     prepare,
+    steps.described,
     20.0,
     slow_fails=False,
     share=2.0,
 )
-_: Any = CHECK

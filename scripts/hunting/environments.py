@@ -355,12 +355,12 @@ def prepare() -> None:
 
 
 BATCHES = Check(
-    "batches", "single environments against batches of 1, 3, 300 and 1,100, bit for bit", batch_trial, prepare, 60.0
+    "batches", "single environments against batches of 1, 3, 300 and 1,100, bit for bit", batch_trial, prepare, patience=60.0
 )
 INTERPRETED_CHECK = Check(
-    "interpreted", "compiled against interpreted code, bit for bit", interpreted_trial, prepare, 120.0, slow_fails=False
+    "interpreted", "compiled against interpreted code, bit for bit", interpreted_trial, prepare, patience=120.0, slow_fails=False
 )
-INFOS = Check("infos", "a step's info: of one moment, and of the plant's forces there", info_trial, prepare, 60.0)
+INFOS = Check("infos", "a step's info: of one moment, and of the plant's forces there", info_trial, prepare, patience=60.0)
 
 if __name__ == "__main__":
     print(json.dumps(fingerprints(int(sys.argv[1]), int(sys.argv[2]))))

@@ -160,5 +160,5 @@ def prepare() -> None:
 
 
 CHECK = Check(
-    "events", "event lists of simulate: the same whatever the sampling and the holding", trial, prepare, 60.0, share=2.0
+    "events", "event lists of simulate: the same whatever the sampling and the holding", trial, prepare, patience=60.0, share=2.0
 )

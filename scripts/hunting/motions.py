@@ -154,9 +154,9 @@ def prepare() -> None:
     attractors(OscillatorParameters(friction="coulomb"))
 
 
-ATTRACTORS = Check("attractors", "attractors draw in what starts beside them", attractor_trial, prepare, 60.0)
+ATTRACTORS = Check("attractors", "attractors draw in what starts beside them", attractor_trial, prepare, patience=60.0)
 MULTIPLIERS = Check(
-    "multipliers", "multipliers of forced orbits: the same from a section on an event", multiplier_trial, prepare, 60.0
+    "multipliers", "multipliers of forced orbits: the same from a section on an event", multiplier_trial, prepare, patience=60.0
 )
-LABELS = Check("labels", "labels of basins against direct runs", label_trial, prepare, 120.0)
+LABELS = Check("labels", "labels of basins against direct runs", label_trial, prepare, patience=120.0)
 FILES = Check("files", "damaged and hostile files", file_trial, patience=120.0)

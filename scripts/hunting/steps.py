@@ -278,13 +278,19 @@ def drawn(seed: int, index: int) -> tuple[OscillatorParameters, Start]:
     return p, draws.start(rng, p, INTERVAL)
 
 
+def described(seed: int, index: int) -> str:
+    """Return the plant and the start of a trial as one types them."""
+    p, at = drawn(seed, index)
+    return f"{draws.described(p)}, {at}"
+
+
 def trial(seed: int, index: int) -> Mapping[str, float]:
     """Check one step of one random plant."""
     p, at = drawn(seed, index)
     try:
         return examine(p, at)
     except Failure as found:
-        found.add_note(f"{draws.described(p)}, {at}")
+        found.add_note(described(seed, index))
         raise
 
 
@@ -300,5 +306,6 @@ CHECK = Check(
     "single steps: finite, in the cone, honest, energy balanced, the same in 1, 2 and 4 pieces",
     trial,
     prepare,
+    described,
     share=4.0,
 )

@@ -26,6 +26,10 @@ class SetAside(Exception):  # noqa: N818
     """Why a trial says nothing: counted apart and printed."""
 
 
+def nothing() -> None:
+    """Prepare nothing."""
+
+
 @dataclass(frozen=True)
 class Check:
     """One kind of trial.
@@ -35,6 +39,7 @@ class Check:
         trial: runs the trial of a seed and an index; returns numbers whose greatest are printed, or None; raises
             :class:`Failure` or :class:`SetAside`. Any other exception is a failure too.
         prepare: is run once in the process of the trials, such as to compile.
+        drawn: returns what a trial is about, for those that had to be ended.
         patience: seconds after which a trial is ended. slow_fails: whether it then counts as failed, or is set aside.
         share: of the time of a hunt that is bounded by minutes.
     """
@@ -42,7 +47,8 @@ class Check:
     name: str
     title: str
     trial: Callable[[int, int], Mapping[str, float] | None]
-    prepare: Callable[[], None] = lambda: None
+    prepare: Callable[[], None] = nothing
+    drawn: Callable[[int, int], Any] | None = None
     patience: float = 20.0
     slow_fails: bool = True
     share: float = 1.0
@@ -110,7 +116,7 @@ def hunt(
     count: int | None,
     seconds: float | None,
     most_slow: int,
-    report: Callable[[Findings], None] = lambda findings: None,
+    report: Callable[[Findings], None] | None = None,
 ) -> Findings:
     """Run trials of a check, from index ``first`` on, until ``count`` are done, ``seconds`` are over, or ``most_slow``
     had to be ended."""
@@ -134,10 +140,11 @@ def hunt(
         worker.start()
         theirs.close()
         try:
+            now[0] = -1.0
             if not ours.poll(_STARTING):
                 raise RuntimeError(f"the check {check.name} was not ready after {_STARTING:g} s")
             ours.recv()
-            now[0], now[1] = -1.0, time.monotonic()
+            now[1] = time.monotonic()
             begun = begun or time.monotonic()
             while not enough():
                 index, since = int(now[0]), now[1]
@@ -146,16 +153,21 @@ def hunt(
                         upcoming = result[0] + 1
                         if count is None or findings.tried < count:
                             findings.add(*result)
-                    report(findings)
+                    if report is not None:
+                        report(findings)
                 elif time.monotonic() - since > check.patience and int(now[0]) == index and index >= 0:
                     slow.add(index)
                     words = f"[slow] not done after {check.patience:g} s"
+                    if check.drawn is not None:
+                        words += f"\n      {check.drawn(seed, index)}"
                     findings.add(index, "failed" if check.slow_fails else "aside", words, {})
                     break
         except EOFError:  # the process of the trials crashed
             index = int(now[0])
-            slow.add(index)
             worker.join()
+            if index < 0:
+                raise RuntimeError(f"the check {check.name} cannot begin: exit status {worker.exitcode}") from None
+            slow.add(index)
             findings.add(index, "failed", f"[crash] the process ended with exit status {worker.exitcode}", {})
         except KeyboardInterrupt:
             print("\ninterrupted", file=sys.stderr)

@@ -108,7 +108,7 @@ def kind_of(words: str) -> str:
 
 def replay(name: str) -> int:
     """Run one trial in this process; return the exit status."""
-    check, seed, index = name.rsplit("-", 2)
+    check, seed, index = ["", "", "", *name.rsplit("-", 2)][-3:]
     if check not in CHECKS or not (seed.isdigit() and index.isdigit()):
         print(f"--replay must be CHECK-SEED-INDEX with a check of {', '.join(CHECKS)}, got {name!r}", file=sys.stderr)
         return 2

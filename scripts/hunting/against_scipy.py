@@ -2,16 +2,17 @@
 
 import math
 from collections.abc import Mapping
+from unittest import mock
 
 import numpy as np
 from scipy.integrate import DOP853, Radau
 
 import tests.oracle as oracle
-from sd_friction_env import OscillatorParameters, kernel
 from scripts.hunting import steps
 from scripts.hunting.draws import Start
 from scripts.hunting.steps import INTERVAL, STATUS, V, X
 from scripts.hunting.trials import Check, Failure, SetAside
+from sd_friction_env import OscillatorParameters, kernel
 
 GAP = 1e-6  # of x and v, relative to max(1, |x|, |v|)
 STIFF = 300.0  # rate of decay from which the implicit method takes over
@@ -28,11 +29,9 @@ def stiffness(p: OscillatorParameters, at: Start) -> float:
 
 def answer(p: OscillatorParameters, at: Start) -> oracle.Run:
     """Return the oracle's answer."""
-    oracle.DOP853 = Radau if stiffness(p, at) > STIFF else DOP853  # type: ignore[misc, assignment]
-    try:
+    solver = Radau if stiffness(p, at) > STIFF else DOP853
+    with mock.patch.object(oracle, "DOP853", solver):
         return oracle.run(p, at.x, at.v, [(INTERVAL, at.u, at.a_belt)], at.v_belt, at.time)
-    finally:
-        oracle.DOP853 = DOP853  # type: ignore[misc]
 
 
 def growth(p: OscillatorParameters, at: Start) -> float:

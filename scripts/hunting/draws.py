@@ -1,6 +1,5 @@
 """Random legal plants, states and tasks over the whole of what is accepted, ends included."""
 
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -16,7 +15,12 @@ LAW_FIELDS = {
     "hyperbolic": ("delta",),
     "exponential": ("mu_k", "v_0", "mu_v"),
 }
-SPRING_FIELDS: dict[str, tuple[str, ...]] = {"exact": ("alpha",), "cubic": ("alpha",), "linear": (), "duffing": ("kappa",)}
+SPRING_FIELDS: dict[str, tuple[str, ...]] = {
+    "exact": ("alpha",),
+    "cubic": ("alpha",),
+    "linear": (),
+    "duffing": ("kappa",),
+}
 _SCALES = ("time_scale", "length_scale", "force_scale")
 
 
@@ -124,23 +128,16 @@ def start(rng: np.random.Generator, parameters: OscillatorParameters, interval: 
 
 
 def described(parameters: OscillatorParameters) -> str:
-    """Return a plant as one types it: the fields that its laws use, or that are not as they are by default."""
-    used = fields_used(parameters.geometry, parameters.friction)
+    """Return a plant as one types it: the fields that are not as they are by default."""
     words = [f"geometry={parameters.geometry!r}", f"friction={parameters.friction!r}"]
     for name in RANGES:
         value = getattr(parameters, name)
         off = name.startswith(EXCITATIONS) and not getattr(parameters, f"{name.split('_')[0]}_amplitude")
         if value != getattr(NOMINAL, name) and name not in _SCALES and not off:
             words.append(f"{name}={value!r}")
-    del used
     return f"OscillatorParameters({', '.join(words)})"
 
 
 def keywords(arguments: Mapping[str, Any]) -> str:
     """Return arguments as one types them."""
     return ", ".join(f"{name}={value!r}" for name, value in arguments.items())
-
-
-def finite(*numbers: float) -> bool:
-    """Whether all of these are finite."""
-    return all(map(math.isfinite, numbers))

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from sd_friction_env import OscillatorParameters, Trajectory, simulate
-from sd_friction_env.simulation import Event
 from scripts.hunting import draws
 from scripts.hunting.trials import Check, Failure, SetAside
+from sd_friction_env import OscillatorParameters, Trajectory, simulate
+from sd_friction_env.simulation import Event
 
 END = 5.0
 STEPS = (1.0, 0.1, 0.01)  # times between samples, held against one piece
@@ -73,7 +73,9 @@ class Reference:
         mine, its = self.history.events, other.events
         place = first_difference(mine, its)
         if place is not None and self.decided(place):
-            raise Failure(f"events: {how.split()[0]}", f"one piece has {listed(self.history)}; {how} has {listed(other)}")
+            raise Failure(
+                f"events: {how.split()[0]}", f"one piece has {listed(self.history)}; {how} has {listed(other)}"
+            )
         worst = 0.0
         for i in range(len(mine) if place is None else place):
             gap = abs(mine[i].time - its[i].time)
@@ -89,8 +91,8 @@ class Reference:
         return worst
 
 
-def drawn(seed: int, index: int) -> tuple[np.random.Generator, Reference]:
-    """Return the random numbers and the history of a trial."""
+def drawn(seed: int, index: int) -> Reference:
+    """Return the history of a trial."""
     rng = draws.generator(seed, index)
     p = draws.plant(rng)
     at = draws.start(rng, p, 0.1)
@@ -102,7 +104,7 @@ def drawn(seed: int, index: int) -> tuple[np.random.Generator, Reference]:
     x = at.x
     if rng.random() < 0.3:
         x, held["force"] = float(rng.uniform(-0.5, 0.5)), float(rng.uniform(-0.1, 0.1))
-    return rng, Reference(p, x, v, held)
+    return Reference(p, x, v, held)
 
 
 def reproduced(reference: Reference, **arguments: Any) -> str:
@@ -113,7 +115,7 @@ def reproduced(reference: Reference, **arguments: Any) -> str:
 
 def trial(seed: int, index: int) -> Mapping[str, float]:
     """Check the events of one history under samplings that are even, and that end where an event lies."""
-    rng, reference = drawn(seed, index)
+    reference = drawn(seed, index)
     history = reference.history
     if history.status in ("step limit", "event limit"):
         raise SetAside(history.status)
@@ -133,16 +135,15 @@ def trial(seed: int, index: int) -> Mapping[str, float]:
             found.add_note(reproduced(reference, **shown))
             raise
         numbers["largest gap of event times"] = max(gap, numbers["largest gap of event times"])
-    del rng
     balance = history.energy
     # Where forces in balance do little work the sum of the works is small: energies count as well.
     works = (balance.damping, balance.contact, balance.control, balance.excitation, balance.change)
     residual = abs(balance.residual) / (sum(map(abs, works)) + 0.5 * reference.v**2 + 1e-3)
     if not residual <= ENERGY:
         kind = "energy: garbage" if not residual <= 1e-4 else "energy: inexact"
-        found = Failure(kind, f"the energy balance of simulate misses by {residual:.3g} of the works: {balance}")
-        found.add_note(reproduced(reference, dt=1e3))
-        raise found
+        missed = Failure(kind, f"the energy balance of simulate misses by {residual:.3g} of the works: {balance}")
+        missed.add_note(reproduced(reference, dt=1e3))
+        raise missed
     numbers["largest residual of simulate's energy balance"] = residual
     return numbers
 
@@ -160,5 +161,10 @@ def prepare() -> None:
 
 
 CHECK = Check(
-    "events", "event lists of simulate: the same whatever the sampling and the holding", trial, prepare, patience=60.0, share=2.0
+    "events",
+    "event lists of simulate: the same whatever the sampling and the holding",
+    trial,
+    prepare,
+    patience=60.0,
+    share=2.0,
 )

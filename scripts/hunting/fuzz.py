@@ -11,20 +11,39 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from scripts.hunting import draws
+from scripts.hunting.trials import Check, Failure
 from sd_friction_env import OscillatorParameters, SDFrictionEnv, SDFrictionVectorEnv, simulate
 from sd_friction_env.parameters import RANGES
 from sd_friction_env.task import Task
-from scripts.hunting import draws
-from scripts.hunting.trials import Check, Failure
 
 ALLOWED = (TypeError, ValueError, gym.error.Error)
 COMMAND_SECONDS = 30.0
+MODULE = ("-m", "sd_friction_env")
 _NUMBERS: tuple[Any, ...] = (
     *(math for math in (float("nan"), float("inf"), -float("inf"), 0.0, -0.0, 1.0, -1.0, 0.5, 1e308, -1e308, 5e-324)),
     *(10**400, -(10**400), 2**63, True, False, 3, np.float32(0.3), np.float64("nan"), np.int64(7)),
 )
 _ODD: tuple[Any, ...] = (
-    *(None, "", "1", "nan", "cycle", "force", b"1", 1j, (), [], {}, [1.0], (0.1, 0.2), {"alpha": 0.5}, object(), int, len),
+    *(
+        None,
+        "",
+        "1",
+        "nan",
+        "cycle",
+        "force",
+        b"1",
+        1j,
+        (),
+        [],
+        {},
+        [1.0],
+        (0.1, 0.2),
+        {"alpha": 0.5},
+        object(),
+        int,
+        len,
+    ),
     *(np.zeros(0), np.ones(1), np.ones((2, 2)), np.array("x"), np.array(None), np.datetime64("2020-01-01"), range(3)),
 )
 
@@ -90,7 +109,11 @@ def argument_trial(seed: int, index: int) -> None:
             options = {"parameters": {name: value}}
         size = int(rng.choice([0, 1, 3]))
         names = (*options, *(name for name in [name] if "parameters" in options), "options")
-        refused(f"reset of {size or 'one'} with options={shown(options)}", lambda: made(size).reset(seed=1, options=options), names)
+        refused(
+            f"reset of {size or 'one'} with options={shown(options)}",
+            lambda: made(size).reset(seed=1, options=options),
+            names,
+        )
     elif what == 5:
         size = int(rng.choice([0, 1, 3]))
         action = value if rng.random() < 0.3 else [value] if not size else [[value]] * size
@@ -107,11 +130,14 @@ def argument_trial(seed: int, index: int) -> None:
             arguments |= {"force": [0.0, 0.1]}
         if isinstance(arguments.get("t_end"), int | float) and abs(arguments["t_end"]) > 100:
             arguments["dt"] = 1e6
-        call = f"simulate(OscillatorParameters(), {', '.join(f'{key}={shown(entry)}' for key, entry in arguments.items())})"
+        words = ", ".join(f"{key}={shown(entry)}" for key, entry in arguments.items())
+        call = f"simulate(OscillatorParameters(), {words})"
         refused(call, lambda: simulate(OscillatorParameters(), **{"t_end": 1.0, **arguments}), tuple(arguments))
     elif what == 7:
         size = int(rng.choice([0, 1, 3]))
-        refused(f"reset of {size or 'one'} with seed={shown(value)}", lambda: made(size).reset(seed=value), ("seed", "Seed"))
+        refused(
+            f"reset of {size or 'one'} with seed={shown(value)}", lambda: made(size).reset(seed=value), ("seed", "Seed")
+        )
     else:
         low_high = (value, other)
         call = f"SDFrictionEnv(randomise={{{name!r}: ({shown(value)}, {shown(other)})}})"
@@ -157,12 +183,43 @@ _COMMANDS = {
     "completion": (),
     "no-such-command": (),
 }
-_WORDS = ("nan", "inf", "-1", "0", "1", "0.5", "1e400", "1:2:0.1", "1:2:-1", "2:1:0.1", "0:1:0", "x", "", "é", "--", "exact", "cubic")
-_WORDS += ("force", "bash", "both", "up", "/no/such/folder/file.csv", "file.PNG", "100", "0.1", "10", "ppo", "../..", "coulomb")
+_WORDS: tuple[str, ...] = (
+    "nan",
+    "inf",
+    "-1",
+    "0",
+    "1",
+    "0.5",
+    "1e400",
+    "1:2:0.1",
+    "1:2:-1",
+    "2:1:0.1",
+    "0:1:0",
+    "x",
+    "",
+    "é",
+    "--",
+    "exact",
+    "cubic",
+)
+_WORDS += (
+    "force",
+    "bash",
+    "both",
+    "up",
+    "/no/such/folder/file.csv",
+    "file.PNG",
+    "100",
+    "0.1",
+    "10",
+    "ppo",
+    "../..",
+    "coulomb",
+)
 
 
 def command_line(rng: np.random.Generator) -> list[str]:
-    """Return a random command line: a command that may exist, options that it has or has not, values that fit or not."""
+    """Return a random command line: a command, options that it has or has not, values that fit or not."""
     command = str(rng.choice(list(_COMMANDS)))
     options = _COMMANDS[command]
     line = [command]
@@ -182,10 +239,16 @@ def command_trial(seed: int, index: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
         environment = {**os.environ, "PYTHONPATH": path, "MPLBACKEND": "agg"}
-        command = [sys.executable, "-m", "sd_friction_env", *line]
+        command = [sys.executable, *MODULE, *line]
         try:
             done = subprocess.run(
-                command, cwd=folder, env=environment, capture_output=True, stdin=subprocess.DEVNULL, timeout=COMMAND_SECONDS
+                command,
+                check=False,
+                cwd=folder,
+                env=environment,
+                capture_output=True,
+                stdin=subprocess.DEVNULL,
+                timeout=COMMAND_SECONDS,
             )
         except subprocess.TimeoutExpired:
             raise Failure("command: slow", f"not done after {time.monotonic() - begun:.0f} s: {words}") from None

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sd_friction_env import OscillatorParameters, kernel
-from sd_friction_env.parameters import EXCITATIONS, RANGES, SMALLEST_ALPHA
 from scripts.hunting import draws, steps
 from scripts.hunting.draws import Start
 from scripts.hunting.trials import Check, Failure
+from sd_friction_env import OscillatorParameters, kernel
+from sd_friction_env.parameters import EXCITATIONS, RANGES, SMALLEST_ALPHA
 
 LONGEST = 1.0  # s of processor time that one control interval may take
 _REPEATS = 3  # of an interval that took longer: the least time counts

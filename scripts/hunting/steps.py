@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tests.oracle as oracle
-from sd_friction_env import OscillatorParameters, kernel
 from scripts.hunting import draws
 from scripts.hunting.draws import Start
 from scripts.hunting.trials import Check, Failure, SetAside
+from sd_friction_env import OscillatorParameters, kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ MARGIN = 10.0
 FINE = 16
 
 
-@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(error_model="numpy")
 def in_pieces(plant, x, v, v_belt, a_belt, u, duration, moved, dx, dv, rows):  # type: ignore[no-untyped-def]
     """Advance over ``duration`` in as many equal pieces as there are ``rows``, which take what ``advance`` returns.
 
@@ -53,7 +53,7 @@ def in_pieces(plant, x, v, v_belt, a_belt, u, duration, moved, dx, dv, rows):  #
     return pieces
 
 
-@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(error_model="numpy")
 def at_nodes(plant, x, v, v_belt, a_belt, u, duration, piece, nodes, weights, rows):  # type: ignore[no-untyped-def]
     """Put times, x, v and weights of a quadrature over ``duration`` into ``rows``; between events it is smooth.
 
@@ -91,7 +91,9 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 _NODES, _WEIGHTS = 0.5 * (1.0 + _NODES), 0.5 * _WEIGHTS
 
 
-def run(p: OscillatorParameters, at: Start, duration: float, pieces: int, moved: tuple[int, float, float] = (-1, 0, 0)):
+def run(
+    p: OscillatorParameters, at: Start, duration: float, pieces: int, moved: tuple[int, float, float] = (-1, 0, 0)
+) -> FloatArray:
     """Return what each piece gave, (n, 12)."""
     rows = np.empty((pieces, 12))
     plant = kernel.later(p.plant, at.time)
@@ -125,7 +127,9 @@ def excitation_work(p: OscillatorParameters, at: Start, x_end: float, duration: 
     return works[-1]
 
 
-def forces(p: OscillatorParameters, x: float, v: float, belt: float, a_belt: float, u: float, time: float) -> list[float]:
+def forces(
+    p: OscillatorParameters, x: float, v: float, belt: float, a_belt: float, u: float, time: float
+) -> list[float]:
     """Return the absolute values of all forces."""
     speed, acceleration = (float(part) for part in oracle.ripple(p, time)[1:])
     normal = float(oracle.normal_force(p, x, time))
@@ -191,7 +195,12 @@ def energy_residual(p: OscillatorParameters, at: Start, rows: FloatArray) -> flo
     reached = INTERVAL * (len(rows) - 1) / max(1, len(rows)) if len(rows) > 1 else 0.0
     reached += float(rows[-1, TIME])
     begin, end = oracle.stiffness(p, at.time), oracle.stiffness(p, at.time + reached)
-    energies = (0.5 * at.v**2, float(begin * oracle.potential(p, at.x)), 0.5 * v**2, float(end * oracle.potential(p, x)))
+    energies = (
+        0.5 * at.v**2,
+        float(begin * oracle.potential(p, at.x)),
+        0.5 * v**2,
+        float(end * oracle.potential(p, x)),
+    )
     works = [-2.0 * p.beta * float(rows[:, INT_V2].sum()), float(rows[:, INT_FV].sum()), at.u * (x - at.x)]
     if p.excited:
         works.append(excitation_work(p, at, x, reached, sum(map(abs, energies))))
@@ -222,7 +231,9 @@ def apart(a: FloatArray, b: FloatArray) -> float:
     return float(np.abs(a[-1, [X, V]] - b[-1, [X, V]]).max())
 
 
-def check_pieces(p: OscillatorParameters, at: Start, whole: FloatArray, others: list[FloatArray]) -> Mapping[str, float]:
+def check_pieces(
+    p: OscillatorParameters, at: Start, whole: FloatArray, others: list[FloatArray]
+) -> Mapping[str, float]:
     """Check that runs in pieces end where the ``whole`` does.
 
     The error that is promised at each moment is carried to the end by the flow: where that matters, it is measured, by
@@ -244,8 +255,13 @@ def check_pieces(p: OscillatorParameters, at: Start, whole: FloatArray, others: 
     gap = max(apart(fine, other) for other in (whole, *others))
     bound = MARGIN * (spread + error)
     if not gap <= bound:
-        ends = "; ".join(f"{len(r)}: {r[-1, X]:.12g}, {r[-1, V]:.12g} ({r[-1, STATUS]:g})" for r in (whole, *others, fine))
-        raise Failure(grade("pieces", gap / max(1.0, *map(abs, fine[-1, [X, V]]))), f"pieces end {gap:.3g} apart, {bound:.3g} is allowed: {ends}")
+        ends = "; ".join(
+            f"{len(r)}: {r[-1, X]:.12g}, {r[-1, V]:.12g} ({r[-1, STATUS]:g})" for r in (whole, *others, fine)
+        )
+        raise Failure(
+            grade("pieces", gap / max(1.0, *map(abs, fine[-1, [X, V]]))),
+            f"pieces end {gap:.3g} apart, {bound:.3g} is allowed: {ends}",
+        )
     return {}
 
 
@@ -266,7 +282,9 @@ def examine(p: OscillatorParameters, at: Start) -> Mapping[str, float]:
     numbers: dict[str, Any] = dict(check_pieces(p, at, runs[0], runs[1:]))
     residual = energy_residual(p, at, runs[0])
     if not residual <= ENERGY:
-        raise Failure(grade("energy", residual), f"the energy balance misses by {residual:.3g} of the works and energies")
+        raise Failure(
+            grade("energy", residual), f"the energy balance misses by {residual:.3g} of the works and energies"
+        )
     numbers["largest residual of the energy balance"] = residual
     return numbers
 

@@ -1,5 +1,6 @@
 """The hunt itself: trials run one after another in a process of their own, which may hang or crash without harm."""
 
+import math
 import multiprocessing
 import signal
 import sys
@@ -91,15 +92,17 @@ def outcome(check: Check, seed: int, index: int) -> tuple[int, str, str, dict[st
         return index, "failed", f"[{type(error).__name__}] at {where}: {error}", {}
 
 
-def _work(check: Check, seed: int, first: int, skipped: frozenset[int], now: Any, pipe: Connection) -> None:
-    """Run trials from ``first`` on until told otherwise, and send what became of them."""
+def _work(
+    check: Check, seed: int, first: int, last: float, skipped: frozenset[int], now: Any, pipe: Connection
+) -> None:
+    """Run trials from ``first`` on, but none from ``last`` on, and send what became of them."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     check.prepare()
     done: list[tuple[int, str, str, dict[str, float]]] = []
     sent = time.monotonic()
     index = first
     pipe.send([])
-    while True:
+    while index < last:
         if index not in skipped:
             now[0], now[1] = index, time.monotonic()
             done.append(outcome(check, seed, index))
@@ -107,6 +110,9 @@ def _work(check: Check, seed: int, first: int, skipped: frozenset[int], now: Any
         if time.monotonic() - sent > _POLL:
             pipe.send(done)
             done, sent = [], time.monotonic()
+    now[0] = -1.0
+    pipe.send(done)
+    time.sleep(_STARTING)  # until ended
 
 
 def hunt(
@@ -126,7 +132,7 @@ def hunt(
     slow: set[int] = set()
     # Until the first trials are in no time counts: compiling may take minutes.
     begun: float | None = None
-    upcoming = first
+    upcoming, last = first, math.inf if count is None else first + count
 
     def enough() -> bool:
         late = seconds is not None and begun is not None and time.monotonic() - begun > seconds
@@ -135,7 +141,7 @@ def hunt(
     while not enough():
         ours, theirs = context.Pipe()
         worker = context.Process(
-            target=_work, args=(check, seed, upcoming, frozenset(slow), now, theirs), daemon=True
+            target=_work, args=(check, seed, upcoming, last, frozenset(slow), now, theirs), daemon=True
         )
         worker.start()
         theirs.close()
@@ -151,8 +157,7 @@ def hunt(
                 if ours.poll(_POLL):
                     for result in ours.recv():
                         upcoming = result[0] + 1
-                        if count is None or findings.tried < count:
-                            findings.add(*result)
+                        findings.add(*result)
                     if report is not None:
                         report(findings)
                 elif time.monotonic() - since > check.patience and int(now[0]) == index and index >= 0:

@@ -49,12 +49,17 @@ class Reference:
 
     @property
     def near(self) -> list[Trajectory]:
-        """Histories from starts close by; a start on the belt stays there."""
+        """Histories from starts (one on the belt stays there) and under forces close by, and damped a little more:
+        a stick forgets the start, and an undamped motion comes back to the belt's speed whatever the force."""
         if self._near is None:
             scale = MOVED * max(1.0, abs(self.x), abs(self.v))
             ways = [(scale, 0.0), (-scale, 0.0)]
             ways += [] if self.v == self.parameters.first_belt_speed else [(0.0, scale), (0.0, -scale)]
             self._near = [self.run(moved, dt=1e3) for moved in ways]
+            u, beta = self.arguments["force"], self.parameters.beta
+            self._near += [self.run(dt=1e3, force=u + by) for by in (scale, -scale)]
+            damped = self.parameters.replace(beta=beta + (MOVED if beta < 1.0 else -MOVED))
+            self._near.append(simulate(damped, self.x, self.v, **{**self.arguments, "dt": 1e3}))
         return self._near
 
     def decided(self, place: int) -> bool:

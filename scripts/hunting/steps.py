@@ -307,6 +307,8 @@ def trial(seed: int, index: int) -> Mapping[str, float]:
     p, at = drawn(seed, index)
     try:
         return examine(p, at)
+    except OverflowError as error:  # the oracle's forces, at what no plant reaches
+        raise Failure("not finite", f"{error}\n      {described(seed, index)}") from None
     except Failure as found:
         found.add_note(described(seed, index))
         raise

@@ -122,7 +122,7 @@ def multiplier_trial(seed: int, index: int) -> Mapping[str, float]:
 
 def label_trial(seed: int, index: int) -> None:
     """Check labels of basins against direct runs."""
-    starts, _, others = borrowed("hunt_basins", "check_basins")(own_seed(seed, index), STARTS)
+    starts, _, others = borrowed(LABELS.needs, "check_basins")(own_seed(seed, index), STARTS)
     wrong = [other for other in others if other["verdict"] not in ("not settled", "slow")]
     if wrong:
         raise Failure(f"labels: {wrong[0]['verdict']}", f"{len(wrong)} of {starts} starts, such as {wrong[0]}")
@@ -130,7 +130,7 @@ def label_trial(seed: int, index: int) -> None:
 
 def file_trial(seed: int, index: int) -> None:
     """Check what damaged files do."""
-    wrong = borrowed("hunt_files", "check_files")(own_seed(seed, index))
+    wrong = borrowed(FILES.needs, "check_files")(own_seed(seed, index))
     wrong = wrong[-1] if isinstance(wrong, tuple) else wrong
     if wrong:
         raise Failure("files", f"{wrong}")
@@ -143,10 +143,7 @@ def own_seed(seed: int, index: int) -> int:
 
 def borrowed(module: str, function: str) -> Callable[..., Any]:
     """Return a check of another script."""
-    try:
-        check: Callable[..., Any] = getattr(importlib.import_module(f"scripts.{module}"), function)
-    except ModuleNotFoundError:
-        raise SetAside(f"scripts/{module}.py is not here") from None
+    check: Callable[..., Any] = getattr(importlib.import_module(module), function)
     return check
 
 
@@ -164,5 +161,7 @@ MULTIPLIERS = Check(
     prepare,
     patience=60.0,
 )
-LABELS = Check("labels", "labels of basins against direct runs", label_trial, prepare, patience=120.0)
-FILES = Check("files", "damaged and hostile files", file_trial, patience=120.0)
+LABELS = Check(
+    "labels", "labels of basins against direct runs", label_trial, prepare, patience=120.0, needs="scripts.hunt_basins"
+)
+FILES = Check("files", "damaged and hostile files", file_trial, patience=120.0, needs="scripts.hunt_files")

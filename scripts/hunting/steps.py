@@ -102,29 +102,31 @@ def run(
     return rows[:done]
 
 
-def excitation_work(p: OscillatorParameters, at: Start, x_end: float, duration: float, size: float) -> float:
-    """Return the work of the excitation, by quadrature of this file's own, finer and finer until it is known to a
-    hundredth of what the energy balance may miss.
+def excitation_work(p: OscillatorParameters, at: Start, duration: float, size: float) -> float:
+    """Return the work of the excitation, by quadrature of this file's own, in finer and finer pieces until it is known
+    to a tenth of what the energy balance may miss.
 
-    That of the force is integrated by parts: x is smoother than v.
+    Raises:
+        SetAside: if it does not become known.
     """
     acting = [kind for kind in ("force", "ripple", "stiffness") if getattr(p, f"{kind}_amplitude")]
     piece = min(0.05, *(0.5 / getattr(p, f"{kind}_frequency") for kind in acting))
     plant = kernel.later(p.plant, at.time)
     rows = np.empty((100_000, 4))
-    ends = oracle.exciting_force(p, at.time + duration) * x_end - oracle.exciting_force(p, at.time) * at.x
-    works: list[float] = []
+    before = math.nan
     for _ in range(11):
-        t, x, v, weights = rows[: at_nodes(plant, *at[:5], duration, piece, _NODES, _WEIGHTS, rows)].T
-        angles = p.force_frequency * (at.time + t) + p.force_phase
-        power = p.force_amplitude * p.force_frequency * np.sin(angles) * x
-        power += oracle.stiffness_rate(p, at.time + t) * oracle.potential(p, x)
-        works.append(float(ends + np.sum(weights * power)))
-        size += abs(works[-1])
-        if len(t) == len(rows) or (len(works) > 1 and abs(works[-1] - works[-2]) < 0.01 * ENERGY * size):
+        nodes = at_nodes(plant, *at[:5], duration, piece, _NODES, _WEIGHTS, rows)
+        if nodes == len(rows):
             break
+        t, x, v, weights = rows[:nodes].T
+        power = oracle.exciting_force(p, at.time + t) * v
+        power += oracle.stiffness_rate(p, at.time + t) * oracle.potential(p, x)
+        work = float(np.sum(weights * power))
+        if abs(work - before) < 0.1 * ENERGY * (size + abs(work)):
+            return work
+        before = work
         piece *= 0.5
-    return works[-1]
+    raise SetAside("the work of the excitation does not become known")
 
 
 def forces(
@@ -202,11 +204,11 @@ def energy_residual(p: OscillatorParameters, at: Start, rows: FloatArray) -> flo
         float(end * oracle.potential(p, x)),
     )
     works = [-2.0 * p.beta * float(rows[:, INT_V2].sum()), float(rows[:, INT_FV].sum()), at.u * (x - at.x)]
-    if p.excited:
-        works.append(excitation_work(p, at, x, reached, sum(map(abs, energies))))
-    residual = energies[2] + energies[3] - energies[0] - energies[1] - sum(works)
     size = sum(map(abs, energies)) + sum(map(abs, works)) + p.alpha * p.alpha + 1e-3
-    return abs(residual) / size
+    if p.excited:
+        works.append(excitation_work(p, at, reached, size))
+    residual = energies[2] + energies[3] - energies[0] - energies[1] - sum(works)
+    return abs(residual) / (size + abs(sum(works[3:])))
 
 
 def allowed(p: OscillatorParameters, at: Start, rows: FloatArray, duration: float) -> float:

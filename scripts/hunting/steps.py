@@ -64,6 +64,7 @@ def at_nodes(plant, x, v, v_belt, a_belt, u, duration, piece, nodes, weights, ro
     n_events = out[6]
     t = 0.0
     n = 0
+    belt = v_belt
     for event in range(n_events + 1):
         end = events[event, 0] if event < n_events else duration
         pieces = int((end - t) / piece) + 1
@@ -73,15 +74,16 @@ def at_nodes(plant, x, v, v_belt, a_belt, u, duration, piece, nodes, weights, ro
                 if n == len(rows):
                     return n
                 dt = nodes[j] * length
-                out = kernel.advance(kernel.later(plant, t), x, v, v_belt + a_belt * t, a_belt, u, dt, None)
+                out = kernel.advance(kernel.later(plant, t), x, v, belt, a_belt, u, dt, None)
                 rows[n, 0] = t + dt
                 rows[n, 1] = out[0]
                 rows[n, 2] = out[1]
                 rows[n, 3] = weights[j] * length
                 n += 1
-            out = kernel.advance(kernel.later(plant, t), x, v, v_belt + a_belt * t, a_belt, u, length, None)
+            out = kernel.advance(kernel.later(plant, t), x, v, belt, a_belt, u, length, None)
             x = out[0]
             v = out[1]
+            belt = out[2]  # as it is returned: a stuck mass has this speed to the bit
             t = t + length
         t = end
     return n

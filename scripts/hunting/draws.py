@@ -21,6 +21,19 @@ SPRING_FIELDS: dict[str, tuple[str, ...]] = {
     "linear": (),
     "duffing": ("kappa",),
 }
+# What makes a plant hard to follow, where it is used: an end of its range.
+_HARD = {
+    "v_m": 0,
+    "v_0": 0,
+    "alpha": 0,
+    "delta": 1,
+    "mu_s": 1,
+    "g1": 1,
+    "kappa": 1,
+    "belt_speed": 1,
+    "mu_v": 1,
+    "beta": 1,
+}
 _SCALES = ("time_scale", "length_scale", "force_scale")
 
 
@@ -62,17 +75,14 @@ def fields_used(geometry: str, friction: str) -> set[str]:
     return {"g1", "beta", "mu_s", "belt_speed", *SPRING_FIELDS[geometry], *LAW_FIELDS[friction]}
 
 
-def values(
-    rng: np.random.Generator, excited: float = 0.3, unused: bool = False, geometry: str = "", friction: str = ""
-) -> dict[str, Any]:
+def values(rng: np.random.Generator, excited: float = 0.3, unused: bool = False, hard: float = 0.0) -> dict[str, Any]:
     """Return fields of :class:`OscillatorParameters`.
 
     Args:
         excited: share of the plants that are excited. unused: whether fields that the plant's laws do not use are drawn
-            as well, over the whole of their ranges. geometry, friction: fixed if given.
+            as well, over the whole of their ranges. hard: share of the plants that are pushed to where they are stiff.
     """
-    geometry = geometry or str(rng.choice(GEOMETRIES))
-    friction = friction or str(rng.choice(FRICTIONS))
+    geometry, friction = str(rng.choice(GEOMETRIES)), str(rng.choice(FRICTIONS))
     used = fields_used(geometry, friction)
     drawn: dict[str, Any] = {"geometry": geometry, "friction": friction}
     for name, (low, high) in RANGES.items():
@@ -80,6 +90,10 @@ def values(
             drawn[name] = number(rng, low, high)
             if name in used and rng.random() < 0.3:  # plants of which most is ordinary have their own faults
                 drawn[name] = getattr(NOMINAL, name)
+    stiff = rng.random() < hard
+    for name in sorted(used & _HARD.keys()) if stiff else ():
+        if rng.random() < 0.3:
+            drawn[name] = RANGES[name][_HARD[name]]
     for name in ("mu_m", "mu_k"):
         if name in used:
             drawn[name] = drawn["mu_s"] * min(1.0, max(0.0, rng.uniform(-0.1, 1.1)))
@@ -96,7 +110,7 @@ def values(
     if rng.random() < excited:
         kinds = [kind for kind in EXCITATIONS if rng.random() < 0.5] or [EXCITATIONS[int(rng.integers(3))]]
         for name in (f"{kind}_{what}" for kind in kinds for what in ("amplitude", "frequency", "phase")):
-            drawn[name] = number(rng, *RANGES[name])
+            drawn[name] = RANGES[name][1] if stiff and rng.random() < 0.3 else number(rng, *RANGES[name])
     return drawn
 
 

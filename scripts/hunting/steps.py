@@ -296,7 +296,7 @@ def examine(p: OscillatorParameters, at: Start) -> Mapping[str, float]:
 def drawn(seed: int, index: int) -> tuple[OscillatorParameters, Start]:
     """Return the plant and the start of a trial."""
     rng = draws.generator(seed, index)
-    p = draws.plant(rng)
+    p = draws.plant(rng, hard=0.1)
     return p, draws.start(rng, p, INTERVAL)
 
 

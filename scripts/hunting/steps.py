@@ -54,9 +54,10 @@ def in_pieces(plant, x, v, v_belt, a_belt, u, duration, moved, dx, dv, rows):  #
 
 
 @numba.njit(error_model="numpy")
-def at_nodes(plant, x, v, v_belt, a_belt, u, duration, piece, nodes, weights, rows):  # type: ignore[no-untyped-def]
+def at_nodes(plant, x, v, v_belt, a_belt, u, duration, piece, finer, nodes, weights, rows):  # type: ignore[no-untyped-def]
     """Put times, x, v and weights of a quadrature over ``duration`` into ``rows``; between events it is smooth.
 
+    The pieces are no longer than ``piece``, and then so many times finer.
     Return how many; the rest has no room.
     """
     events = np.empty((kernel.MAX_EVENTS, 4))
@@ -67,7 +68,7 @@ def at_nodes(plant, x, v, v_belt, a_belt, u, duration, piece, nodes, weights, ro
     belt = v_belt
     for event in range(n_events + 1):
         end = events[event, 0] if event < n_events else duration
-        pieces = int((end - t) / piece) + 1
+        pieces = finer * (int((end - t) / piece) + 1)
         length = (end - t) / pieces
         for _ in range(pieces if length > 0.0 else 0):
             for j in range(len(nodes)):
@@ -114,10 +115,10 @@ def excitation_work(p: OscillatorParameters, at: Start, duration: float, size: f
     acting = [kind for kind in ("force", "ripple", "stiffness") if getattr(p, f"{kind}_amplitude")]
     piece = min(0.05, *(0.5 / getattr(p, f"{kind}_frequency") for kind in acting))
     plant = kernel.later(p.plant, at.time)
-    rows = np.empty((100_000, 4))
+    rows = np.empty((10_000, 4))
     before = math.nan
-    for _ in range(11):
-        nodes = at_nodes(plant, *at[:5], duration, piece, _NODES, _WEIGHTS, rows)
+    for halvings in range(11):
+        nodes = at_nodes(plant, *at[:5], duration, piece, 2**halvings, _NODES, _WEIGHTS, rows)
         if nodes == len(rows):
             break
         t, x, v, weights = rows[:nodes].T
@@ -127,7 +128,6 @@ def excitation_work(p: OscillatorParameters, at: Start, duration: float, size: f
         if abs(work - before) < 0.1 * ENERGY * (size + abs(work)):
             return work
         before = work
-        piece *= 0.5
     raise SetAside("the work of the excitation does not become known")
 
 

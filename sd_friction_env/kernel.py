@@ -145,6 +145,40 @@ def _with_laws(plant, laws, side, time):
 
 
 @compiled
+def _phase_of(rate, phase, time):
+    angle = rate * time + phase
+    return angle % (2.0 * math.pi) if abs(angle) > 2.0 * math.pi else angle
+
+
+@compiled
+def _from_now(plant, laws):
+    """Return the plant with its clock set to zero: small phases are rounded less while a motion is followed."""
+    if laws is None:
+        return plant
+    if laws.force == 0.0 and laws.ripple == 0.0 and laws.depth == 0.0:
+        return plant
+    new = Laws(
+        laws.side,
+        laws.friction,
+        laws.mu_k,
+        laws.decay,
+        laws.mu_v,
+        laws.kappa,
+        laws.force,
+        laws.force_rate,
+        _phase_of(laws.force_rate, laws.force_phase, laws.time),
+        laws.ripple,
+        laws.ripple_rate,
+        _phase_of(laws.ripple_rate, laws.ripple_phase, laws.time),
+        laws.depth,
+        laws.depth_rate,
+        _phase_of(laws.depth_rate, laws.depth_phase, laws.time),
+        0.0,
+    )
+    return Plant(plant.geometry, plant.alpha, plant.g1, plant.beta, plant.mu_s, plant.k1, plant.k3, new)
+
+
+@compiled
 def later(plant, t):
     """Return the plant as it is after a time t."""
     return _later(plant, plant.laws, t)
@@ -1486,6 +1520,7 @@ def _advance(plant, mode, x, v, v_belt, a_belt, u, duration, events, known):
         v = v_belt
     if spring(plant, x_room)[1] <= 0.0:
         return x_room, v_room, v_belt, mode, CONTACT_LOST, 0.0, 0, 0.0, 0.0, 0.0, x_room, x_room
+    plant = _from_now(plant, plant.laws)
     while t < duration:
         remaining = duration - t
         now = later(plant, t)
@@ -1569,7 +1604,7 @@ def trace(plant, mode, x, v, v_belt, a_belt, u, times, samples, events):
         int_v2 += dv2
         stick_time += dstick
         int_fv += dfv
-        with_belt = v == room_v(later(now, dt), belt)
+        with_belt = v == room_v(later(_from_now(now, now.laws), dt), belt)
         t = times[taken] if status == OK else t + dt
         belt = v_belt + a_belt * t  # by one formula, however the motion is cut into pieces
         if with_belt:

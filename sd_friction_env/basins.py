@@ -31,6 +31,7 @@ LOST_CONTACT, UNDECIDED = -1, -2
 _Classify = Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.int8]], None]
 
 _STARTS_WORTH_A_THREAD = 20_000
+_MOST_TURNINGS, _SAMPLED_TURNINGS = 20_000, 400  # that a start is followed for, and one of those below
 _SAMPLED_MAXIMA = (3, 16, 240)  # first few, then many, among those with which motions leave a range of radii
 
 
@@ -131,15 +132,17 @@ def _classifier(parameters: OscillatorParameters) -> tuple[tuple[LimitCycle, ...
         bound_labels,
     )
 
-    def classify(x: NDArray[np.float64], v: NDArray[np.float64], into: NDArray[np.int8]) -> None:
-        kernel.classify(parameters.plant, parameters.belt_speed, x, v, *known, into)
+    def classify(
+        x: NDArray[np.float64], v: NDArray[np.float64], into: NDArray[np.int8], turnings: int = _MOST_TURNINGS
+    ) -> None:
+        kernel.classify(parameters.plant, parameters.belt_speed, x, v, *known, turnings, into)
 
     def label_from(low: float, high: float) -> int:
         """Return the label of all maxima between two places, UNDECIDED if they have not one."""
         label = UNDECIDED
         for count in _SAMPLED_MAXIMA:
             reached = np.empty(count, dtype=np.int8)
-            classify(np.linspace(low, high, count + 2)[1:-1], np.zeros(count), reached)
+            classify(np.linspace(low, high, count + 2)[1:-1], np.zeros(count), reached, _SAMPLED_TURNINGS)
             if (reached == UNDECIDED).any() or (reached != (reached[0] if label == UNDECIDED else label)).any():
                 return UNDECIDED
             label = int(reached[0])

@@ -1666,7 +1666,6 @@ SLIP_PATIENCE = 2000.0
 FIRST_PIECE, CREEP_PIECE = 1e-3, 30.0  # of slip, after which it is seen whether it creeps into a node
 STEPS_OF_A_PIECE, MOST_PIECES = 3e4, 400
 SETTLING_LAPS, SETTLING_EXITS = 8, 64  # before a passive motion that still slips is looked at more closely
-MOST_TURNINGS = 20_000  # of one start, in `classify`
 TRAP_POINTS, TRAP_REFINEMENTS = 600, 5  # distances from a node at which its trap is seen to hold, and finer ones
 
 # A row of `traps` says which states certainly tend to a stable equilibrium.
@@ -1920,13 +1919,16 @@ def slip_returns_to_stick(plant, v_belt, x, traps):
 
 
 @compiled
-def classify(plant, v_belt, xs, vs, exits, exit_labels, traps, trap_labels, centres, bounds, bound_labels, labels):
+def classify(
+    plant, v_belt, xs, vs, exits, exit_labels, traps, trap_labels, centres, bounds, bound_labels, turnings, labels
+):
     """Write the label of the attractor that each start (xs, vs) of shape (n,) reaches into ``labels``.
 
     A start that sticks is carried to the next of the ``exits`` (ascending) and has its label; one that a trap holds
     has the trap's. A start that slips from a maximum of x less than ``bounds[i, j]`` to the right of ``centres[i]``,
     the next to its left, has ``bound_labels[i, j]`` for the first such j (rows end with infinite bounds labelled -2,
-    "not decided yet"). -1: lost contact, -2: not decided.
+    "not decided yet"). -1: lost contact, -2: not decided after so
+    many ``turnings`` and landings.
     """
     for n in range(len(xs)):
         x = xs[n]
@@ -1936,7 +1938,7 @@ def classify(plant, v_belt, xs, vs, exits, exit_labels, traps, trap_labels, cent
         if spring(plant, x)[1] <= 0.0:
             labels[n] = -1
             continue
-        for _ in range(MOST_TURNINGS):
+        for _ in range(turnings):
             if mode == STICK:
                 for i in range(len(exits)):
                     if x <= exits[i] + SAME_PLACE * max(1.0, abs(x)):

@@ -23,7 +23,7 @@ PIP := -m pip --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint format slow reference benchmark benchmark-peers figures report docs constraints clean
+.PHONY: help setup demo test lint format slow reference benchmark benchmark-peers figures report docs constraints clean hunt
 
 help: ## list the targets
 	@echo "Usage: make TARGET [ARGS=...] [PYTHON=python3.12] [TORCH_INDEX=https://download.pytorch.org/whl/cpu]"
@@ -73,6 +73,9 @@ slow: setup ## run the tests that take minutes
 
 reference: setup ## print the numbers that the project promises, beside what it reaches
 	"$(RUN)" scripts/reference_numbers.py $(ARGS)
+
+hunt: setup ## hold random legal plants, tasks, files and command lines against independent answers (five minutes)
+	"$(RUN)" scripts/hunt.py $(ARGS)
 
 benchmark: setup ## measure the speed, ours and others', in one run (minutes)
 	"$(RUN)" scripts/benchmark.py $(ARGS)

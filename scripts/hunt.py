@@ -10,7 +10,6 @@ Ctrl-C ends the check that runs, prints what was found until then, and stops.
 """
 
 import argparse
-import importlib.util
 import sys
 import time
 from collections import Counter
@@ -54,9 +53,6 @@ def main(arguments: list[str] | None = None) -> int:
     if chosen.replay:
         return replay(chosen.replay)
     checks = [CHECKS[name] for name in chosen.only or CHECKS]
-    for check in [check for check in checks if check.needs and not importlib.util.find_spec(check.needs)]:
-        print(f"{check.name}: passed over, {check.needs} is not here")
-        checks.remove(check)
     shares = sum(check.share for check in checks)
     failed = 0
     for check in checks:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from scripts.hunt_basins import check_basins
+from scripts.hunting.labels import check_basins
 from sd_friction_env import (
     OrbitError,
     OscillatorParameters,

@@ -13,7 +13,8 @@ import pytest
 import yaml
 
 from agents import training
-from scripts import hunt_files, seal
+from scripts import seal
+from scripts.hunting import files as hunt_files
 from sd_friction_env import storage
 from sd_friction_env.storage import LockedError, StoredFileError
 

@@ -43,7 +43,6 @@ class Check:
         drawn: returns what a trial is about, for those that had to be ended.
         patience: seconds after which a trial is ended. slow_fails: whether it then counts as failed, or is set aside.
         share: of the time of a hunt that is bounded by minutes.
-        needs: a module without which the check is passed over.
     """
 
     name: str
@@ -54,7 +53,6 @@ class Check:
     patience: float = 20.0
     slow_fails: bool = True
     share: float = 1.0
-    needs: str = ""
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Try to have damaged and hostile files taken for good ones, or to make them costly.
 
-    python scripts/hunt_files.py [--seed N]
+    python -m scripts.hunting.files [--seed N]
 
 Bits of checkpoints, policies and tables are flipped, files are cut short and swapped, and every reader is given files
 that are made to harm. Each must be refused by name within a second and 200 MB. Needs fork, so not Windows.
@@ -498,7 +498,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
-        prog="hunt_files.py",
+        prog="python -m scripts.hunting.files",
     )
     parser.add_argument("--seed", type=int, default=0, help="of what is tried (default: 0)")
     tried, held, failed = check_files(parser.parse_args(arguments).seed)

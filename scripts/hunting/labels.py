@@ -1,7 +1,7 @@
 """Compare the labels of ``basins`` with direct runs of random starts of random plants.
 
-    python scripts/hunt_basins.py                          20,000 starts, seed 0
-    python scripts/hunt_basins.py --seed 3 --starts 600
+    python -m scripts.hunting.labels                          20,000 starts, seed 0
+    python -m scripts.hunting.labels --seed 3 --starts 600
 
 A direct run follows the motion by ``kernel.advance`` alone and knows nothing of return maps: it is held against the
 extremes of x of the attractor that the label names, in stretches of growing length. It is "not settled" where its

@@ -132,7 +132,7 @@ def argument_trial(seed: int, index: int) -> None:
             arguments["dt"] = 1e6
         words = ", ".join(f"{key}={shown(entry)}" for key, entry in arguments.items())
         call = f"simulate(OscillatorParameters(), {words})"
-        refused(call, lambda: simulate(OscillatorParameters(), **{"t_end": 1.0, **arguments}), tuple(arguments))
+        refused(call, lambda: simulate(OscillatorParameters(), **{"t_end": 1.0, **arguments}), (*arguments, "hold"))
     elif what == 7:
         size = int(rng.choice([0, 1, 3]))
         refused(

@@ -10,7 +10,8 @@ from scripts.hunting import draws, files, labels
 from scripts.hunting.trials import Check, Failure, SetAside
 from sd_friction_env import OscillatorParameters, attractors, kernel, simulate
 from sd_friction_env.forced import forced_orbit
-from sd_friction_env.orbits import LimitCycle, OrbitError
+from sd_friction_env.orbits import LimitCycle, OrbitError, equilibria
+from sd_friction_env.parameters import STATE_LIMIT
 
 LAPS = 20
 MOVED = 1e-3  # of a cycle's size
@@ -22,16 +23,25 @@ STARTS = 12  # of one plant, in basins
 def distance_left(cycle: LimitCycle, moved: float) -> float:
     """Return which share of a distance from a cycle or an equilibrium is left after some laps, by a direct run."""
     p = cycle.parameters
-    period = cycle.period
-    if not period > 0.0:
-        slope = kernel.spring_slopes(p.plant, cycle.x_phase0)[0]
-        period = 2.0 * math.pi / math.sqrt(max(abs(slope), 1e-2))
+    period, time = cycle.period, LAPS * cycle.period
+    if not period > 0.0:  # of a place, how long its own eigenvalues need
+        place = min(equilibria(p), key=lambda place: abs(place.x - cycle.x_max))
+        slowest = max(place.eigenvalues, key=lambda value: value.real)
+        period = 2.0 * math.pi / max(abs(slowest.imag), 0.1)
+        time = max(LAPS * period, -3.0 / slowest.real if slowest.real else 0.0)
     x, v = cycle.x_max + moved, 0.0
-    out = kernel.advance(p.plant, x, v, p.belt_speed, 0.0, 0.0, LAPS * period, None)
+    out = kernel.advance(p.plant, x, v, p.belt_speed, 0.0, 0.0, time, None)
+    if out[4] in (kernel.STEP_LIMIT, kernel.EVENT_LIMIT):
+        raise SetAside(kernel.STATUS_NAMES[out[4]])
     if out[4] != kernel.OK:
         return math.inf
     out = kernel.advance(p.plant, out[0], out[1], p.belt_speed, 0.0, 0.0, 1.25 * period, None)
     return float(max(abs(out[11] - cycle.x_max), abs(out[10] - cycle.x_min)) / abs(moved))
+
+
+def place_scale(p: OscillatorParameters, x: float) -> float:
+    """Return over which distance the forces near a place change."""
+    return max(min(1.0, p.alpha) if "alpha" in draws.SPRING_FIELDS[p.geometry] and p.alpha else 1.0, 1e-3 * abs(x))
 
 
 def attractor_trial(seed: int, index: int) -> Mapping[str, float] | None:
@@ -46,7 +56,7 @@ def attractor_trial(seed: int, index: int) -> Mapping[str, float] | None:
         found = attractors(p)
         for cycle in found:
             if cycle.kind in ("pure-slip", "steady-slip"):
-                size = cycle.amplitude if cycle.amplitude > 0.0 else 1e-3
+                size = cycle.amplitude if cycle.amplitude > 0.0 else 1e-3 * place_scale(p, cycle.x_max)
                 left = min(distance_left(cycle, sign * MOVED * size) for sign in (1.0, -1.0))
                 if not left < 1.0 - ATTRACTS:
                     words = f"a {cycle.kind} attractor of amplitude {cycle.amplitude:.3g}, multiplier "
@@ -91,13 +101,15 @@ def multiplier_trial(seed: int, index: int) -> Mapping[str, float]:
         orbit = forced_orbit(p, 0.3, 0.0, most=4, phase=0.137)
     except OrbitError:
         raise SetAside("no short periodic motion is reached") from None
+    if max(abs(orbit.x), abs(orbit.v)) > STATE_LIMIT:
+        raise SetAside("a motion beyond where one may start")
     if orbit.singular_events:
         raise SetAside("singular events, which the result tells")
     begin = orbit.phase * 2.0 * math.pi / rate
     at_section = p.replace(**{f"{kind}_phase": math.remainder(phase + rate * begin, 2.0 * math.pi)})
     history = simulate(at_section, orbit.x, orbit.v, orbit.period, dt=1e3)
     worst = 0.0
-    for event in history.events[:6]:
+    for event in [event for event in history.events[:6] if max(abs(event.x), abs(event.v)) <= STATE_LIMIT]:
         shifted = p.replace(**{f"{kind}_phase": math.remainder(phase + rate * (begin + event.time), 2.0 * math.pi)})
         try:
             other = forced_orbit(shifted, event.x, event.v, multiple=orbit.multiple, transient=0)

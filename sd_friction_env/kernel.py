@@ -62,6 +62,7 @@ HUGE_EXPONENT = 700.0  # a trial step across the surface may ask for more, and i
 PHASE_ROUNDING = 1e-15  # of a phase, relative to itself
 ROUNDING = 1e-14  # of a sum of forces, relative to the greatest of them
 SIDE_ZERO = 1e-14  # x this small is on neither side of zero
+LAYER_REACH = 4.0  # by so many times its distance and its width may a step change v_rel next to a friction layer
 LAST_STRETCH = 1e-5  # of a step: a Taylor step of this length is exact to rounding
 STEP_DOUBLING = 1.0 / 1024.0  # a step this far inside the rule doubles: the error falls as h^8, four times the margin
 
@@ -1048,6 +1049,27 @@ def _rounding(plant, laws, mode, x, v, v_belt):
 
 
 @compiled
+def _leaps_over_layer(plant, laws, gap, gap_end, slope, slope_end, h):
+    """Whether a slip step is so long that its stages may miss how sharply friction falls next to the belt's speed.
+
+    The hyperbolic and the exponential law change over a gap of their own width, and further out over as long as the gap.
+    """
+    if laws is None:
+        return False
+    if laws.friction == HYPERBOLIC:
+        width = 1.0 / max(laws.decay, 1e-300)
+    elif laws.friction == EXPONENTIAL:
+        width = laws.decay
+    else:
+        return False
+    reach = h * max(abs(slope), abs(slope_end))
+    nearest = min(gap, gap_end)
+    if slope < 0.0 < slope_end:
+        nearest = nearest - 0.25 * reach
+    return reach > LAYER_REACH * (max(nearest, 0.0) + width)
+
+
+@compiled
 def _at_zero(laws, x):
     """Return x = 0, in the ripple's frame."""
     if laws is None:
@@ -1078,7 +1100,6 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
     int_fv = 0.0
     event = NO_EVENT
     first = True
-    gap = 0.0
     while t < duration:
         remaining = duration - t
         h = min(h, remaining)
@@ -1094,7 +1115,15 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
         x_end, v_end, a, a_end, error, dv2, dfv = trial
         allowed = TOLERANCE * h * max(1.0, abs(x), abs(v), STIFF * abs(a))
         noise = h * _rounding(now, now.laws, mode, x, v, belt)
-        if not error <= max(allowed, noise):  # "not" lets a NaN shrink the step too
+        if not error <= max(allowed, noise) or _leaps_over_layer(
+            now,
+            now.laws,
+            mode * (v - belt),
+            mode * (v_end - belt - a_belt * h),
+            mode * (a - a_belt),
+            mode * (a_end - a_belt),
+            h,
+        ):  # "not" lets a NaN shrink the step too
             h = 0.5 * h
             if h < MIN_SLIP_STEP or trials + SLIP_TRIAL_RATE * t < 0.0:
                 event = STEP_SIZE_UNDERFLOW
@@ -1111,7 +1140,10 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
         else:  # it has just left the stick surface
             lands = gap_end < -V_REL_ZERO
         guess = known[8]
-        if lands:
+        if not lands and gap > V_REL_ZERO and gap_end <= V_REL_ZERO:
+            v_end = belt + a_belt * h  # it lands with the step's end, but for rounding
+            event = LANDING
+        elif lands:
             if not looked:
                 guess = _closing_guess(gap, slope, gap_end, slope_end, h)
         elif _dips(gap, slope, gap_end, slope_end, h):
@@ -1170,6 +1202,12 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
             length = _contact_loss_time(now, mode, x, v, belt, a_belt, u, t_thin)
             x_end, v_end, a, a_end, error, dv2, dfv = slip_step(now, mode, x, v, belt, a_belt * length, u, length)
             event = CONTACT_LOSS
+            if gap > V_REL_ZERO and mode * (v_end - (belt + a_belt * length)) < 0.0:  # it lands before
+                length, x_end, a_end, dv2, dfv = _closing(
+                    now, mode, x, v, belt, a_belt, u, length, 0.5 * length, mode, belt, a_belt, False, False, known[9:]
+                )
+                v_end = belt + a_belt * length
+                event = LANDING
 
         t = duration if event == NO_EVENT and h == remaining else t + length
         x = x_end
@@ -1190,8 +1228,6 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
         belt = v_belt + a_belt * duration
         if mode * (v - belt) <= V_REL_ZERO:
             v = belt
-            if gap > V_REL_ZERO:  # an open gap has closed just now; what has not left the surface yet does not land
-                event = LANDING
     return t, x, v, event, int_v2, int_fv, x_min, x_max, trials + SLIP_TRIAL_RATE * t
 
 
@@ -1435,7 +1471,11 @@ def _excited_ride(plant, laws, x, v_belt, a_belt, u, duration, int_v2, int_fv, x
         return int_v2, int_fv, x_min, x_max
     if laws.force == 0.0 and laws.ripple == 0.0 and laws.depth == 0.0:
         return int_v2, int_fv, x_min, x_max
-    pieces = int(duration / _short_of_excitation(laws, 0.125, 0.5)) + 1
+    piece = _short_of_excitation(laws, 0.125, 0.5)
+    fastest = max(abs(v_belt), abs(v_belt + a_belt * duration)) + laws.ripple
+    if plant.geometry <= CUBIC and fastest > 0.0:
+        piece = min(piece, 0.125 * min(1.0, plant.alpha) / fastest)
+    pieces = int(duration / piece) + 1
     length = duration / pieces
     int_v2 = 0.0
     int_fv = 0.0
@@ -1637,6 +1677,7 @@ def excitation_work(plant, x, v, v_belt, a_belt, u, duration, events):
     integration errors."""
     work = 0.0
     t = 0.0
+    belt = v_belt
     for n in range(len(events) + 1):
         end = events[n, 0] if n < len(events) else duration
         pieces = int((end - t) / _short_of_excitation(plant.laws, 0.5, 0.05)) + 1
@@ -1644,12 +1685,13 @@ def excitation_work(plant, x, v, v_belt, a_belt, u, duration, events):
         for _ in range(pieces if length > 0.0 else 0):
             # Each node is reached from the piece's beginning, so that no error adds up.
             for j in range(5):
-                out = advance(later(plant, t), x, v, v_belt + a_belt * t, a_belt, u, _NODES[j] * length, None)
+                out = advance(later(plant, t), x, v, belt, a_belt, u, _NODES[j] * length, None)
                 then = later(plant, t + _NODES[j] * length)
                 work += _WEIGHTS[j] * length * _excitation_power(then, then.laws, out[0], out[1])
-            out = advance(later(plant, t), x, v, v_belt + a_belt * t, a_belt, u, length, None)
+            out = advance(later(plant, t), x, v, belt, a_belt, u, length, None)
             x = out[0]
             v = out[1]
+            belt = out[2]  # to the bit, so that a stuck mass stays stuck
             t = t + length
         t = end
     return work

@@ -111,7 +111,7 @@ def checked_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
     Raises:
         ValueError: if it is not.
     """
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {brief_repr(value)}")
     return str(value)
 

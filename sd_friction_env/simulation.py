@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env import kernel
-from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, checked_number
+from sd_friction_env.parameters import STATE_LIMIT, OscillatorParameters, brief_repr, checked_number
 from sd_friction_env.tables import Table
 
 _MOST_SAMPLES = 50_000_000
@@ -232,8 +232,10 @@ def simulate(
 def _held_values(name: str, values: Any) -> NDArray[np.float64]:
     try:
         array = np.atleast_1d(np.asarray(values, dtype=np.float64))
+    except OverflowError:
+        raise ValueError(f"{name} must be finite and within [-1e6, 1e6], got {brief_repr(values)}") from None
     except (TypeError, ValueError):
-        raise TypeError(f"{name} must be a number or an array of numbers, got {values!r}") from None
+        raise TypeError(f"{name} must be a number or an array of numbers, got {brief_repr(values)}") from None
     if array.ndim != 1 or not array.size:
         raise ValueError(f"{name} must have shape (m,) with m >= 1, got shape {array.shape}")
     if not np.all(np.isfinite(array)) or np.abs(array).max() > 1e6:

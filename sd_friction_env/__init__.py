@@ -13,6 +13,7 @@ if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out f
     from sd_friction_env.curves import amplitude_curve, attractor_curves
     from sd_friction_env.env import EnvState, SDFrictionEnv
     from sd_friction_env.orbits import (
+        ContactLossError,
         CriticalBeltSpeeds,
         Equilibrium,
         LimitCycle,
@@ -41,6 +42,7 @@ _PUBLIC = {
     "CriticalBeltSpeeds": "orbits",
     "LimitCycle": "orbits",
     "Equilibrium": "orbits",
+    "ContactLossError": "orbits",
     "OrbitError": "orbits",
     "limit_cycle": "orbits",
     "equilibria": "orbits",
@@ -63,6 +65,7 @@ _PUBLIC = {
 __all__ = [
     "ENVIRONMENT_IDS",
     "Basins",
+    "ContactLossError",
     "CriticalBeltSpeeds",
     "EnvState",
     "Equilibrium",

@@ -1052,7 +1052,7 @@ def _rounding(plant, laws, mode, x, v, v_belt):
 def _leaps_over_layer(plant, laws, gap, gap_end, slope, slope_end, h):
     """Whether a slip step is so long that its stages may miss how sharply friction falls next to the belt's speed.
 
-    The hyperbolic and the exponential law change over a gap of their own width, and further out over as long as the gap.
+    Both laws with such a layer change over a gap of its width, and further out over one as wide as the gap.
     """
     if laws is None:
         return False

@@ -752,7 +752,7 @@ def serve(
         host: address to listen at; others than this machine can come only if it is not a loopback address.
         port: 0: any that is free. allowed: further names that a request may be for, see
             :func:`sd_friction_env.explorer_server.served_hosts`. sessions: pages at a time, at least 1.
-        browser: open one. say: is told the page's address.
+        browser: open one. say: receives the page's address.
 
     Raises:
         ImportError: if Bokeh is not installed. OSError: if the port is taken. ValueError: if a name is none.

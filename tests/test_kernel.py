@@ -324,3 +324,13 @@ def test_interpreted_and_compiled_text_give_the_same_bits(scenario):
     assert digests[0] == digests[1]
     if scenario == SCENARIO:
         assert all(math.isfinite(value) for (value,) in struct.iter_unpack("<d", bytes.fromhex(outputs[0])))
+
+
+def test_a_step_does_not_leap_over_a_sharp_friction_layer():
+    # SciPy's DOP853 with events gives v = 9.929318769; a step of .1 that missed the layer gave 9.929318869.
+    p = OscillatorParameters(
+        geometry="duffing", friction="hyperbolic", g1=0.001, delta=801.61730657889, belt_speed=10.0
+    )
+    end = kernel.advance(p.plant, -0.8229819684921935, 10.0, 10.0, 0.0, -0.14713030823428672, 0.1, None)
+    assert end[4] == kernel.OK
+    assert end[1] == pytest.approx(9.929318769, abs=1e-9)

@@ -53,6 +53,7 @@ MAX_SLIP_STEP = 0.2
 MIN_SLIP_STEP = 1e-16
 # A motion that needs more trial steps than these is given up (STEP_LIMIT): so many at once, so many per unit of time.
 SLIP_TRIALS, SLIP_TRIAL_RATE = 100000.0, 15000.0
+FASTEST_DAMPING = 3.0  # a step times the rate at which friction and damping change v_rel
 STIFF = 1e-4  # where friction is so steep that v changes by |a| h, no estimate gets below 1e-14 of that change
 MAX_EVENTS = 256  # in one call of advance
 NOTHING_KNOWN = (0.0,) * 18  # of a slip that begins
@@ -709,8 +710,11 @@ def _slip_step(plant, mode, x, v, v_belt, dv_belt, u, h):
     square5 = e5x * e5x + e5v * e5v
     square3 = e3x * e3x + e3v * e3v
     blend = 2.0 * (square5 + 0.01 * square3) + 1e-200
-    # Where the stages overflow, a finite number over an infinite one would read as no error at all.
-    error = h * square5 / math.sqrt(blend) if blend < math.inf else math.inf
+    # Where the stages overflow, a finite number over an infinite one would read as no error at all. Where friction damps
+    # faster than the stages can follow, the estimate may be small by accident.
+    rate = abs(friction_slope(plant, mode, v - v_belt) * spring(plant, room_x(plant, x))[1]) + 2.0 * plant.beta
+    meaningful = (blend < math.inf) & (h * rate <= FASTEST_DAMPING)
+    error = h * square5 / math.sqrt(blend) if meaningful else math.inf
     return x_end, v_end, a1, a12, error, int_v2, int_fv
 
 
@@ -760,6 +764,15 @@ def _aging_jerk(plant, laws, mode, x, v_rel, jerk):
         return jerk
     drive, restoring, normal = _aging(plant, laws, x)
     return jerk + drive - restoring - _friction_coefficient(plant, laws, mode, v_rel) * normal
+
+
+@compiled
+def _without_aging(plant, laws, x, slope):
+    """Take from the rate of change of a sum of forces what the drive and the modulated spring have in it."""
+    if laws is None:
+        return slope
+    drive, restoring, _ = _aging(plant, laws, room_x(plant, x))
+    return slope - drive + restoring
 
 
 @compiled
@@ -868,10 +881,12 @@ def _last_stretch(gap, slope, curvature, h):
 @in_lanes
 def _stretch(plant, side, x, v, a, contact, curvature, dt, int_v2, int_fv):
     """Return x, the integral of v^2 and that of the contact force's power after a Taylor step of length dt in slip."""
-    contact_slope = side * curvature + 2.0 * plant.beta * a + spring_slopes(plant, x)[0] * v
     w = room_v(plant, v)
-    int_v2 = int_v2 + dt * (w * (w + a * dt))
-    int_fv = int_fv + dt * (contact * w + 0.5 * dt * (contact * a + contact_slope * w))
+    b = _room_a(plant.laws, a)
+    contact_slope = side * curvature + 2.0 * plant.beta * b + spring_slopes(plant, room_x(plant, x))[0] * w
+    contact_slope = _without_aging(plant, plant.laws, x, contact_slope)
+    int_v2 = int_v2 + dt * (w * (w + b * dt))
+    int_fv = int_fv + dt * (contact * w + 0.5 * dt * (contact * b + contact_slope * w))
     return x + dt * (v + 0.5 * a * dt), int_v2, int_fv
 
 
@@ -904,7 +919,10 @@ def _closing(plant, mode, x, v, v_belt, a_belt, u, h, t, side, level, rate, turn
         if near or high - low < TIME_ZERO:
             break
         t = t + dt
-    x_t, dv2, dfv = _stretch(later(plant, t), side, x_t, v_t, a_t, f_t, curvature, dt, dv2, dfv)
+    now = later(plant, t)
+    if turning:
+        curvature = _of_turning(now.laws, -side, 0.0, 0.0, curvature)[2]
+    x_t, dv2, dfv = _stretch(now, side, x_t, v_t, a_t, f_t, curvature, dt, dv2, dfv)
     return t + dt, x_t, a_t, dv2, dfv
 
 

@@ -250,6 +250,18 @@ def room_v(plant, v):
 
 
 @compiled
+def _v_rel_zero(laws, v_belt):
+    """Return which relative velocities cannot be told from zero where a state is left and taken up again."""
+    if laws is None:
+        return V_REL_ZERO
+    if laws.ripple == 0.0:
+        return V_REL_ZERO
+    # Where a state was left, its time was rounded otherwise, and so was the ripple's phase.
+    phase = laws.ripple_rate * laws.time + abs(laws.ripple_phase)
+    return V_REL_ZERO + PHASE_ROUNDING * (laws.ripple * phase + abs(v_belt))
+
+
+@compiled
 def _into_frame(laws, x, v, v_belt):
     if laws is None:
         return x, v
@@ -257,10 +269,7 @@ def _into_frame(laws, x, v, v_belt):
         return x, v
     way, speed, _, _ = _ripple(laws)
     v = v - speed
-    # Where a state was left, its time was rounded otherwise, and so was the ripple's phase.
-    phase = laws.ripple_rate * laws.time + abs(laws.ripple_phase)
-    zero = V_REL_ZERO + PHASE_ROUNDING * (laws.ripple * phase + abs(v_belt))
-    return x - way, v_belt if abs(v - v_belt) <= zero else v
+    return x - way, v_belt if abs(v - v_belt) <= _v_rel_zero(laws, v_belt) else v
 
 
 @compiled
@@ -710,8 +719,8 @@ def _slip_step(plant, mode, x, v, v_belt, dv_belt, u, h):
     square5 = e5x * e5x + e5v * e5v
     square3 = e3x * e3x + e3v * e3v
     blend = 2.0 * (square5 + 0.01 * square3) + 1e-200
-    # Where the stages overflow, a finite number over an infinite one would read as no error at all. Where friction damps
-    # faster than the stages can follow, the estimate may be small by accident.
+    # Where the stages overflow, a finite number over an infinite one would read as no error at all; where friction
+    # damps faster than they can follow, the estimate may be small by accident.
     rate = abs(friction_slope(plant, mode, v - v_belt) * spring(plant, room_x(plant, x))[1]) + 2.0 * plant.beta
     meaningful = (blend < math.inf) & (h * rate <= FASTEST_DAMPING)
     error = h * square5 / math.sqrt(blend) if meaningful else math.inf
@@ -1158,7 +1167,9 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
         else:  # it has just left the stick surface
             lands = gap_end < -V_REL_ZERO
         guess = known[8]
-        if not lands and gap > V_REL_ZERO and gap_end <= V_REL_ZERO:
+        zero = _v_rel_zero(now.laws, belt)
+        away = gap > zero or slope_end < 0.0 <= slope
+        if not lands and away and gap_end <= zero:
             v_end = belt + a_belt * h  # it lands with the step's end, but for rounding
             event = LANDING
         elif lands:
@@ -1681,6 +1692,10 @@ def energy_in_spring(plant, x):
     return _modulated_pair(plant.laws, potential(plant, x), 0.0)[0]
 
 
+WORK_TOLERANCE = 1e-8  # of the excitation's work over a piece, relative to its greatest power there
+SHORTEST_PIECE = 1.0 / 4096.0
+
+
 @compiled
 def _excitation_power(plant, laws, x, w):
     if laws is None:
@@ -1689,29 +1704,57 @@ def _excitation_power(plant, laws, x, w):
 
 
 @compiled
+def _work_over(plant, x, v, v_belt, a_belt, u, length):
+    """Return the work of the excitation over a piece of the motion by Gauss's formula, and the greatest power met.
+
+    Each node is reached from the beginning, so that no error adds up.
+    """
+    work = 0.0
+    greatest = 0.0
+    for j in range(5):
+        out = advance(plant, x, v, v_belt, a_belt, u, _NODES[j] * length, None)
+        then = later(plant, _NODES[j] * length)
+        power = _excitation_power(then, then.laws, out[0], out[1])
+        work += _WEIGHTS[j] * length * power
+        greatest = max(greatest, abs(power))
+    return work, greatest
+
+
+@compiled
 def excitation_work(plant, x, v, v_belt, a_belt, u, duration, events):
     """Return the work of the excitation over a motion that :func:`trace` has followed for ``duration``: of the exciting
-    force, and of what modulates the stiffness. ``events`` (m, 4) are its events: between them quadrature is exact to
-    integration errors."""
+    force, and of what modulates the stiffness.
+
+    ``events`` (m, 4) are its events. Between them a piece is halved until its halves give the same work as the whole.
+    """
     work = 0.0
     t = 0.0
     belt = v_belt
+    longest = _short_of_excitation(plant.laws, 0.5, 0.05)
     for n in range(len(events) + 1):
         end = events[n, 0] if n < len(events) else duration
-        pieces = int((end - t) / _short_of_excitation(plant.laws, 0.5, 0.05)) + 1
-        length = (end - t) / pieces
-        for _ in range(pieces if length > 0.0 else 0):
-            # Each node is reached from the piece's beginning, so that no error adds up.
-            for j in range(5):
-                out = advance(later(plant, t), x, v, belt, a_belt, u, _NODES[j] * length, None)
-                then = later(plant, t + _NODES[j] * length)
-                work += _WEIGHTS[j] * length * _excitation_power(then, then.laws, out[0], out[1])
-            out = advance(later(plant, t), x, v, belt, a_belt, u, length, None)
+        piece = longest
+        while t < end:
+            last = end - t <= piece
+            length = end - t if last else piece
+            now = later(plant, t)
+            whole, greatest = _work_over(now, x, v, belt, a_belt, u, length)
+            first, power = _work_over(now, x, v, belt, a_belt, u, 0.5 * length)
+            out = advance(now, x, v, belt, a_belt, u, 0.5 * length, None)
+            then = later(now, 0.5 * length)
+            second, _ = _work_over(then, out[0], out[1], out[2], a_belt, u, 0.5 * length)
+            error = abs(first + second - whole)
+            if error > WORK_TOLERANCE * length * max(greatest, power) and length > SHORTEST_PIECE * longest:
+                piece = 0.5 * length
+                continue
+            work += first + second
+            out = advance(then, out[0], out[1], out[2], a_belt, u, 0.5 * length, None)
             x = out[0]
             v = out[1]
             belt = out[2]  # to the bit, so that a stuck mass stays stuck
-            t = t + length
-        t = end
+            if error < STEP_DOUBLING * WORK_TOLERANCE * length * max(greatest, power):
+                piece = min(2.0 * piece, longest)
+            t = end if last else t + length
     return work
 
 

@@ -1692,6 +1692,14 @@ def energy_in_spring(plant, x):
     return _modulated_pair(plant.laws, potential(plant, x), 0.0)[0]
 
 
+@compiled
+def _has_power(laws):
+    """Whether a force or a modulated stiffness is there to do work; the ripple's is the contact's."""
+    if laws is None:
+        return False
+    return laws.force != 0.0 or laws.depth != 0.0
+
+
 WORK_TOLERANCE = 1e-8  # of the excitation's work over a piece, relative to its greatest power there
 SHORTEST_PIECE = 1.0 / 4096.0
 
@@ -1728,31 +1736,37 @@ def excitation_work(plant, x, v, v_belt, a_belt, u, duration, events):
     ``events`` (m, 4) are its events. Between them a piece is halved until its halves give the same work as the whole.
     """
     work = 0.0
-    t = 0.0
+    t = 0.0 if _has_power(plant.laws) else duration
     belt = v_belt
     longest = _short_of_excitation(plant.laws, 0.5, 0.05)
     for n in range(len(events) + 1):
         end = events[n, 0] if n < len(events) else duration
         piece = longest
+        first = -1.0
+        power = -1.0
         while t < end:
             last = end - t <= piece
             length = end - t if last else piece
             now = later(plant, t)
-            whole, greatest = _work_over(now, x, v, belt, a_belt, u, length)
+            whole, greatest = first, power
+            if power < 0.0:
+                whole, greatest = _work_over(now, x, v, belt, a_belt, u, length)
             first, power = _work_over(now, x, v, belt, a_belt, u, 0.5 * length)
             out = advance(now, x, v, belt, a_belt, u, 0.5 * length, None)
             then = later(now, 0.5 * length)
             second, _ = _work_over(then, out[0], out[1], out[2], a_belt, u, 0.5 * length)
             error = abs(first + second - whole)
-            if error > WORK_TOLERANCE * length * max(greatest, power) and length > SHORTEST_PIECE * longest:
+            allowed = WORK_TOLERANCE * length * max(greatest, power)
+            if error > allowed and length > SHORTEST_PIECE * longest:
                 piece = 0.5 * length
                 continue
             work += first + second
+            power = -1.0
             out = advance(then, out[0], out[1], out[2], a_belt, u, 0.5 * length, None)
             x = out[0]
             v = out[1]
             belt = out[2]  # to the bit, so that a stuck mass stays stuck
-            if error < STEP_DOUBLING * WORK_TOLERANCE * length * max(greatest, power):
+            if error < STEP_DOUBLING * allowed:
                 piece = min(2.0 * piece, longest)
             t = end if last else t + length
     return work

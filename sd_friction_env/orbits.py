@@ -30,6 +30,8 @@ _SMALLEST_RADIUS = 1e-7  # orbits smaller than this about an equilibrium are cal
 _FINEST_RATIO = 1.15  # of neighbouring radii at which a return map is sampled
 _SAMPLES_OF_A_GAP = (15, 7)
 _LAP_ERROR = 1e-13  # of a return map, relative to max(1, |x|): what is less is rounding
+_STEP_ERROR = 1e-9  # promised of the steps, per unit of time
+_LARGEST_DOUBTED = 1e-5  # radius up to which that error may hide what a lap does
 _LARGEST_SMALL = 1e-2  # radius about an equilibrium up to which its Hopf normal form holds
 _MOST_SETTLINGS, _MOST_LAPS = 200, 2000
 _LEVEL, _LEVEL_STEP = 1e-9, 1e-4  # where a spring's stiffness is less, the force this far away says more
@@ -583,15 +585,16 @@ class ReturnMap:
                 )
                 rest = [lap for lap in inside if lap[0] >= still]
                 return [core, *(self.parted(kind, still, rest) if len(rest) > 1 else [])]
+        first = 0
+        if low == 0.0 and not self.equilibrium.weak:
+            # The equilibrium is a fixed point too: its linearisation says what rounding hides of small orbits.
+            first = -1 if self.equilibrium.damping > 0.0 else 1
+            known = self.believed(known, first)
         try:
             cycles = self.cycles(kind, known)
-            first = 0
-            if low == 0.0 and not self.equilibrium.weak:
-                # The equilibrium is a fixed point too: its linearisation says what rounding hides of small orbits.
-                first = -1 if self.equilibrium.damping > 0.0 else 1
-                if known and known[0][1] * first < 0.0:
-                    like = [radius for radius, shift in inside if radius < known[0][0] and shift * first > 0.0]
-                    cycles = [self.root(kind, like[-1], known[0][0]), *cycles] if like else cycles
+            if known and known[0][1] * first < 0.0:
+                like = [radius for radius, shift in inside if radius < known[0][0] and shift * first > 0.0]
+                cycles = [self.root(kind, like[-1], known[0][0]), *cycles] if like else cycles
         except _NoLapError as gap:
             inner = max(radius for radius, _ in inside if radius < gap.radius)
             outer = min(radius for radius, _ in inside if radius > gap.radius)
@@ -608,6 +611,14 @@ class ReturnMap:
         if tendencies[0] == 0:
             tendencies[0] = first
         return [LapRange(ends=ends, after=after, cycles=tuple(cycles), tendencies=tuple(tendencies), kind=kind)]
+
+    def believed(self, known: list[tuple[float, float]], first: int) -> list[tuple[float, float]]:
+        """Return the samples (radius, shift) without the smallest orbits that contradict the sign ``first`` of the
+        linearisation within the steps' error, where larger ones agree with it again."""
+        error = _STEP_ERROR * 2.0 * math.pi / math.sqrt(self.equilibrium.stiffness)
+        begin = next((i for i, (_, shift) in enumerate(known) if shift * first > 0.0), 0)
+        small = all(radius < _LARGEST_DOUBTED and abs(shift) <= error for radius, shift in known[:begin])
+        return known[begin:] if small else known
 
     def cycles(self, kind: LapKind | None, known: list[tuple[float, float]]) -> list[float]:
         """Return the radii of cycles among samples (radius, shift) of one kind of lap.

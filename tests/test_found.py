@@ -6,7 +6,7 @@ from scipy.integrate import quad
 
 from scripts.hunting import against_scipy, events, steps
 from scripts.hunting.draws import Start
-from sd_friction_env import OscillatorParameters, simulate
+from sd_friction_env import OscillatorParameters, attractors, equilibria, simulate
 
 # A step of 4.8 to 5.7 times what friction damps in had a small estimate by accident, at the first step of a piece.
 OVERLONG_STEPS = [
@@ -191,3 +191,24 @@ def test_a_landing_with_the_sample_is_listed(plant, start, kind):
     assert landings
     for time in landings[:4]:
         assert reference.check(reference.run(dt=time), "dt") < 1e-9
+
+
+def test_an_equilibrium_that_repels_slowly_is_no_attractor():
+    # A lap about it takes 0.14; orbits of radius 1e-7 seem to shrink within the steps' error, those of 1e-6 grow.
+    p = OscillatorParameters(
+        geometry="cubic",
+        friction="exponential",
+        alpha=0.001,
+        g1=0.05043549069430349,
+        beta=0.0,
+        mu_s=0.012689093007718696,
+        mu_k=0.0,
+        v_0=0.5262982795488951,
+    )
+    assert not any(equilibrium.stable for equilibrium in equilibria(p))
+    assert attractors(p) == []
+    # Just as slowly the other way: damping of 2 beta against 8.4e-4 of growth.
+    damped = p.replace(beta=1e-3)
+    steady = [cycle.x_max for cycle in attractors(damped)]
+    assert steady == [equilibrium.x for equilibrium in equilibria(damped) if equilibrium.stable]
+    assert len(steady) == 2

@@ -970,8 +970,13 @@ class Counted:
     def __neg__(self) -> "Counted":
         return self.operations.known("negative", self.place)[0]  # a change of sign costs next to nothing
 
+    def __abs__(self) -> "Counted":
+        return self.operations.known("absolute", self.place)[0]
+
     def __lt__(self, other: Any) -> bool:
         return True  # as of the numbers that a step accepts; a comparison is no arithmetic
+
+    __le__ = __lt__
 
     def sqrt(self) -> "Counted":
         """Return the square root."""

@@ -47,7 +47,7 @@ EVENT_NAMES = {
 
 FORCE, BELT_SPEED = 0, 1
 
-# Estimated error per unit of time, relative to max(1, |x|, |v|, STIFF |x''|); the estimate can be ten times too low.
+# Estimated error per unit of time, relative to max(1, |x|, |v|, STIFF |x''|); the estimate can be too low.
 TOLERANCE = 1e-10
 MAX_SLIP_STEP = 0.2
 MIN_SLIP_STEP = 1e-16

@@ -1231,7 +1231,7 @@ def slip_until_event(plant, mode, x, v, v_belt, a_belt, u, duration, stop_at_tur
             length = _contact_loss_time(now, mode, x, v, belt, a_belt, u, t_thin)
             x_end, v_end, a, a_end, error, dv2, dfv = slip_step(now, mode, x, v, belt, a_belt * length, u, length)
             event = CONTACT_LOSS
-            if gap > V_REL_ZERO and mode * (v_end - (belt + a_belt * length)) < 0.0:  # it lands before
+            if (gap > V_REL_ZERO or slope > 0.0) and mode * (v_end - (belt + a_belt * length)) < 0.0:  # it lands before
                 length, x_end, a_end, dv2, dfv = _closing(
                     now, mode, x, v, belt, a_belt, u, length, 0.5 * length, mode, belt, a_belt, False, False, known[9:]
                 )

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+import tests.oracle as oracle
 from scripts.hunting import against_scipy, events, steps
 from scripts.hunting.draws import Start
-from sd_friction_env import OscillatorParameters, attractors, equilibria, simulate
+from sd_friction_env import OscillatorParameters, attractors, equilibria, kernel, simulate
 
 # A step of 4.8 to 5.7 times what friction damps in had a small estimate by accident, at the first step of a piece.
 OVERLONG_STEPS = [
@@ -191,6 +192,25 @@ def test_a_landing_with_the_sample_is_listed(plant, start, kind):
     assert landings
     for time in landings[:4]:
         assert reference.check(reference.run(dt=time), "dt") < 1e-9
+
+
+def test_a_mass_that_breaks_away_and_lands_before_it_loses_contact_lands():
+    # It slips backward from the belt's speed and sticks again before it loses contact, 5e-4 later.
+    p = OscillatorParameters(
+        geometry="cubic", friction="exponential", alpha=0.001, g1=0.001, mu_k=0.2, v_0=0.001, mu_v=0.6913225072093898
+    )
+    speed, acceleration = 3.1715389702911914, -0.05238206189911665
+    start = Start(-0.00020641663611019356, speed, speed, acceleration, 0.0, 0.0)
+    p = p.replace(belt_speed=3.1782599899631805)
+    steps.examine(p, start)
+    events = np.zeros((256, 4))
+    end = kernel.advance(p.plant, *start[:5], 0.1, events)
+    with np.errstate(all="ignore"):
+        wanted = oracle.run(p, start.x, start.v, [(0.1, 0.0, acceleration)], speed)
+    kinds = ["restick", "breakaway", "contact-loss"]
+    assert [kernel.EVENT_NAMES[int(kind)] for kind in events[: end[6], 1]] == kinds
+    assert [event.kind for event in wanted.events] == ["stick", "breakaway", "contact-loss"]
+    assert events[:3, 0] == pytest.approx([event.time for event in wanted.events], abs=1e-12)
 
 
 def test_an_equilibrium_that_repels_slowly_is_no_attractor():

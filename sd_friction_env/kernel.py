@@ -53,7 +53,7 @@ MAX_SLIP_STEP = 0.2
 MIN_SLIP_STEP = 1e-16
 # A motion that needs more trial steps than these is given up (STEP_LIMIT): so many at once, so many per unit of time.
 SLIP_TRIALS, SLIP_TRIAL_RATE = 100000.0, 15000.0
-FASTEST_DAMPING = 3.0  # a step times the rate at which friction and damping change v_rel
+FASTEST_DAMPING = 3.0  # a step times the rate at which friction and damping change v_rel: longer ones are doubted
 STIFF = 1e-4  # where friction is so steep that v changes by |a| h, no estimate gets below 1e-14 of that change
 MAX_EVENTS = 256  # in one call of advance
 NOTHING_KNOWN = (0.0,) * 18  # of a slip that begins
@@ -719,11 +719,13 @@ def _slip_step(plant, mode, x, v, v_belt, dv_belt, u, h):
     square5 = e5x * e5x + e5v * e5v
     square3 = e3x * e3x + e3v * e3v
     blend = 2.0 * (square5 + 0.01 * square3) + 1e-200
-    # Where the stages overflow, a finite number over an infinite one would read as no error at all; where friction
-    # damps faster than they can follow, the estimate may be small by accident.
+    # Where friction damps faster than the stages can follow, the fifth-order estimate may be small by accident.
     rate = abs(friction_slope(plant, mode, v - v_belt) * spring(plant, room_x(plant, x))[1]) + 2.0 * plant.beta
-    meaningful = (blend < math.inf) & (h * rate <= FASTEST_DAMPING)
-    error = h * square5 / math.sqrt(blend) if meaningful else math.inf
+    followed = h * rate <= FASTEST_DAMPING
+    numerator = square5 if followed else square3
+    blend = blend if followed else square3 + 1e-200
+    # Where the stages overflow, a finite number over an infinite one would read as no error at all.
+    error = h * numerator / math.sqrt(blend) if blend < math.inf else math.inf
     return x_end, v_end, a1, a12, error, int_v2, int_fv
 
 

@@ -104,7 +104,7 @@ class _Cache(FunctionCache):
             _say_once("unsaved", f"compiled code cannot be kept in {self._cache_path!r}: {fault}")
 
 
-# What numba is told ---------------------------------------------------------------------------------------------------
+# Options for numba ----------------------------------------------------------------------------------------------------
 
 _SECONDS_PER_BYTE = 0.0005  # of bytecode, on a core of 2020
 _PATIENCE = 3.0  # seconds: what takes less is not worth a line

@@ -125,6 +125,11 @@ def _later(plant, laws, t):
 
 @compiled
 def _with_laws(plant, laws, side, time):
+    return _with_phases(plant, laws, side, laws.force_phase, laws.ripple_phase, laws.depth_phase, time)
+
+
+@compiled
+def _with_phases(plant, laws, side, force_phase, ripple_phase, depth_phase, time):
     new = Laws(
         side,
         laws.friction,
@@ -134,13 +139,13 @@ def _with_laws(plant, laws, side, time):
         laws.kappa,
         laws.force,
         laws.force_rate,
-        laws.force_phase,
+        force_phase,
         laws.ripple,
         laws.ripple_rate,
-        laws.ripple_phase,
+        ripple_phase,
         laws.depth,
         laws.depth_rate,
-        laws.depth_phase,
+        depth_phase,
         time,
     )
     return Plant(plant.geometry, plant.alpha, plant.g1, plant.beta, plant.mu_s, plant.k1, plant.k3, new)
@@ -159,25 +164,10 @@ def _from_now(plant, laws):
         return plant
     if laws.force == 0.0 and laws.ripple == 0.0 and laws.depth == 0.0:
         return plant
-    new = Laws(
-        laws.side,
-        laws.friction,
-        laws.mu_k,
-        laws.decay,
-        laws.mu_v,
-        laws.kappa,
-        laws.force,
-        laws.force_rate,
-        _phase_of(laws.force_rate, laws.force_phase, laws.time),
-        laws.ripple,
-        laws.ripple_rate,
-        _phase_of(laws.ripple_rate, laws.ripple_phase, laws.time),
-        laws.depth,
-        laws.depth_rate,
-        _phase_of(laws.depth_rate, laws.depth_phase, laws.time),
-        0.0,
-    )
-    return Plant(plant.geometry, plant.alpha, plant.g1, plant.beta, plant.mu_s, plant.k1, plant.k3, new)
+    force_phase = _phase_of(laws.force_rate, laws.force_phase, laws.time)
+    ripple_phase = _phase_of(laws.ripple_rate, laws.ripple_phase, laws.time)
+    depth_phase = _phase_of(laws.depth_rate, laws.depth_phase, laws.time)
+    return _with_phases(plant, laws, laws.side, force_phase, ripple_phase, depth_phase, 0.0)
 
 
 @compiled
@@ -1703,7 +1693,7 @@ def _has_power(laws):
 
 
 WORK_TOLERANCE = 1e-8  # of the excitation's work over a piece, relative to its greatest power there
-SHORTEST_PIECE = 1.0 / 4096.0
+SHORTEST_PIECE = 1.0 / 4096.0  # of the motion over which that work is found, relative to the longest
 
 
 @compiled

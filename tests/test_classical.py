@@ -304,7 +304,7 @@ def test_a_lock_that_another_process_left_behind_does_not_stop_anyone(tmp_path):
 
 
 def test_where_there_is_no_fcntl_the_lock_is_that_of_windows(tmp_path, monkeypatch):
-    """Its lock says that another one has it: then it is tried again, and any other trouble is told."""
+    """Where another process holds the lock the write is tried again; any other error is raised."""
     file, answers, asked = tmp_path / "gains.json", [errno.EACCES, None, errno.EIO], []
 
     def locking(descriptor, mode, size):

@@ -46,7 +46,7 @@ def follow(page):
 
 
 class ByHand(futures.Executor):
-    """Runs nothing until it is told to."""
+    """An executor that queues its jobs until the test runs them."""
 
     def __init__(self):
         self.submitted = []

@@ -1339,7 +1339,7 @@ def stick_until_event(plant, x, v_belt, a_belt, u, duration):
     each side of it on its own; a side that rises and falls again within a piece is followed to its top. The time
     returned lies just outside the cone.
     """
-    scale = min(1.0, plant.alpha) if plant.geometry == EXACT or plant.geometry == CUBIC else 1.0
+    scale = _length_scale(plant)
     fastest = max(abs(v_belt), abs(v_belt + a_belt * duration))
     plant = faced(plant, x, v_belt)
     piece = duration
@@ -1393,6 +1393,12 @@ def _short_of_excitation(laws, angle, piece):
     if laws.depth != 0.0:
         fastest = max(fastest, laws.depth_rate)
     return min(piece, angle / fastest) if fastest > 0.0 else piece
+
+
+@compiled
+def _length_scale(plant):
+    """Return the distance over which the spring's force bends."""
+    return min(1.0, plant.alpha) if plant.geometry == EXACT or plant.geometry == CUBIC else 1.0
 
 
 @compiled
@@ -1494,8 +1500,8 @@ def _excited_ride(plant, laws, x, v_belt, a_belt, u, duration, int_v2, int_fv, x
         return int_v2, int_fv, x_min, x_max
     piece = _short_of_excitation(laws, 0.125, 0.5)
     fastest = max(abs(v_belt), abs(v_belt + a_belt * duration)) + laws.ripple
-    if plant.geometry <= CUBIC and fastest > 0.0:
-        piece = min(piece, 0.125 * min(1.0, plant.alpha) / fastest)
+    if fastest > 0.0:
+        piece = min(piece, 0.125 * _length_scale(plant) / fastest)
     pieces = int(duration / piece) + 1
     length = duration / pieces
     int_v2 = 0.0

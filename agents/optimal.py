@@ -168,9 +168,14 @@ def _step(task: Task, parameters: OscillatorParameters, states: Array, actions: 
     columns = np.ascontiguousarray(states.reshape(-1, 3).T)
     ends = np.empty_like(columns)
     rewards = np.empty(columns.shape[1])
-    numbers = _constants(task, parameters)
-    arguments: list[Any] = [*numbers, *columns, np.ascontiguousarray(actions.reshape(-1)), *ends, rewards]
-    failures = kernel.control_intervals(*arguments)
+    failures = kernel.control_intervals(
+        parameters.plant,
+        _actuator(task, parameters),
+        *columns,
+        np.ascontiguousarray(actions.reshape(-1)),
+        *ends,
+        rewards,
+    )
     if failures:
         raise RuntimeError(f"{failures} of {rewards.size} states lost contact or were not integrated")
     return ends.T.reshape(*actions.shape, 3), rewards.reshape(actions.shape)
@@ -188,10 +193,8 @@ def make_problem(env_id: str, seeds: Sequence[int]) -> Problem:
     return Problem(env_id, env.task, tuple(parameters), starts)
 
 
-def _constants(task: Task, parameters: OscillatorParameters) -> tuple[float | kernel.Laws | None, ...]:
-    """Return what ``kernel.control_interval`` takes before the state, in its order."""
-    return (
-        *parameters.plant,
+def _actuator(task: Task, parameters: OscillatorParameters) -> kernel.Actuator:
+    return kernel.Actuator(
         ACTUATOR_CODES[task.actuator],
         task.authority,
         task.belt_acceleration_limit,

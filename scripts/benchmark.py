@@ -14,6 +14,7 @@ that the numbers stand for the promised work; a target that is missed is only to
 import argparse
 import contextlib
 import dataclasses
+import importlib
 import importlib.metadata
 import importlib.util
 import itertools
@@ -699,7 +700,7 @@ class WithSciPy:
         self._solve = solve_ivp
         self._belt = p.belt_speed
         self._limit, self._square = p.mu_s, p.alpha * p.alpha
-        self._p, self._k1, self._k3 = p, plant.k1, plant.k3
+        self._p, self._k1, self._k3 = p, plant.friction.k1, plant.friction.k3
         self.x, self.v = x, v
 
     def _spring(self, x: float) -> tuple[float, float]:
@@ -992,14 +993,19 @@ def count_operations(function: Callable[..., Any], names: Sequence[str]) -> Oper
 
 def slip_step_operations() -> Operations:
     """Count the operations of one slip step. Only where numba compiles nothing (NUMBA_DISABLE_JIT=1)."""
-    law: Any = kernel
-    law.math = types.SimpleNamespace(sqrt=Counted.sqrt, inf=math.inf)
+    for name in ("runge_kutta", "springs.inclined"):
+        file: Any = importlib.import_module(f"sd_friction_env.kernel.{name}")
+        file.math = types.SimpleNamespace(sqrt=Counted.sqrt, inf=math.inf)
 
-    def step(alpha: Any, g1: Any, beta: Any, mu_s: Any, k1: Any, k3: Any, *rest: Any) -> Any:
-        return law._slip_step(kernel.Plant(kernel.EXACT, alpha, g1, beta, mu_s, k1, k3), *rest)
+    def step(alpha: Any, mu_s: Any, k1: Any, k3: Any, g1: Any, beta: Any, mode: Any, *motion: Any) -> Any:
+        laws = kernel.Inclined(alpha), kernel.Stribeck(mu_s, k1, k3), kernel.Unexcited()
+        x, v, v_belt, a_belt, u, h = motion
+        return kernel.slip_step(
+            kernel.Plant(*laws, g1, beta), mode, kernel.State(x, v), kernel.Drive(v_belt, a_belt, u), h
+        )
 
     return count_operations(
-        step, ["alpha", "g1", "beta", "mu_s", "k1", "k3", "mode", "x", "v", "v_belt", "dv_belt", "u", "h"]
+        step, ["alpha", "mu_s", "k1", "k3", "g1", "beta", "mode", "x", "v", "v_belt", "a_belt", "u", "h"]
     )
 
 
@@ -1021,7 +1027,7 @@ def arithmetic() -> dict[str, tuple[Callable[[Any, int], None], int, int]]:
     """Return loops that do nothing but arithmetic, all in the first-level cache: each a function of (memory, repeats),
     the operations per element that it does, and the rows of memory that it works on.
 
-    Each row is a chain of its own, so a core finds as much side by side as it can do. Not in kernel.py, and not cached:
+    Each row is a chain of its own, so a core finds as much side by side as it can do. Not in the kernel, not cached:
     this is no law of ours.
     """
     import numba

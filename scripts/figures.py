@@ -13,9 +13,8 @@ import numpy as np
 import sd_friction_env
 from sd_friction_env import OscillatorParameters, Table, amplitude_curve, critical_belt_speeds
 from sd_friction_env.orbits import rest_place
-from sd_friction_env.parameters import Geometry
 
-PANELS: dict[Geometry, str] = {"cubic": "as published (cubic, Eq. 9)", "exact": "exact (Eq. 4)"}
+PANELS = {"cubic": "as published (cubic, Eq. 9)", "exact": "exact (Eq. 4)"}
 
 
 @functools.cache

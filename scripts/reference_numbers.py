@@ -166,7 +166,7 @@ def share_left(speed: float, dither: float, rate: float = 30.0) -> float:
     plant = LINEAR.replace(force_amplitude=dither * rate, force_frequency=rate).plant
     x, v, low, high = 0.0, speed, math.inf, -math.inf
     for t in np.arange(0.0, 8050.0, 10.0).tolist():
-        end = kernel.advance(kernel.later(plant, t), x, v, speed, 0.0, 0.0, 10.0, None)
+        end = kernel.advance(kernel.at_time(plant, t), kernel.State(x, v), kernel.Drive(speed, 0.0, 0.0), 10.0, None)
         x, v = end[0], end[1]
         if t >= 8000.0:
             low, high = min(low, end[10]), max(high, end[11])
@@ -190,7 +190,7 @@ def other_laws(report: Report) -> None:
     report.row("Leine: period", 12.001031294826, cycle.period, 1e-9)
     report.row("Leine: x_max", 1.133944676443, cycle.x_max, 1e-9)
     decay = coulomb.replace(mu_s=1.0, mu_k=1.0, belt_speed=0.0)
-    end = kernel.advance(decay.plant, 12.0, 6.0, 0.0, 0.0, 0.0, 60.0, None)
+    end = kernel.advance(decay.plant, kernel.State(12.0, 6.0), kernel.Drive(0.0, 0.0, 0.0), 60.0, None)
     report.row("Coulomb decay from (12, 6): rest, 8 digits", 0.68217894, end[0], 5.1e-9)
     report.row("Coulomb decay from (12, 6): rest, closed form", theory.coulomb_rest_x(12.0, 6.0), end[0], 1e-10)
     exponential = LINEAR.replace(friction="exponential", mu_s=1.0, mu_k=0.5, v_0=0.5)
@@ -292,9 +292,12 @@ def soak(report: Report, steps: int) -> None:
             events += info["events"]
             fine = math.isfinite(float(reward)) and abs(observation[0]) <= 10.0 and abs(observation[1]) <= 10.0
             if mode == kernel.STICK:
-                load, limit = kernel.stick_load(
-                    env.parameters.plant, info["x"], info["v_belt"], info["belt_acceleration"], info["force"]
+                plant, drive = (
+                    env.parameters.plant,
+                    kernel.Drive(info["v_belt"], info["belt_acceleration"], info["force"]),
                 )
+                load = kernel.stick_load(plant, info["x"], drive)
+                limit = kernel.stick_limit(plant, kernel.SLIP_BACKWARD, info["x"])
                 fine = fine and v_rel == 0.0 and abs(load) <= limit * (1.0 + 1e-9) + 1e-12
             else:
                 fine = fine and mode * v_rel >= 0.0

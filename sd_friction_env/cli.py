@@ -23,42 +23,27 @@ from sd_friction_env.basins import LOST_CONTACT, UNDECIDED, basin_grid
 from sd_friction_env.curves import checked_belt_speeds
 from sd_friction_env.doctor import as_text, examine, hyperparameter_folder, versions_as_text
 from sd_friction_env.forced import lyapunov_exponent, poincare_section
+from sd_friction_env.laws import friction_table
 from sd_friction_env.orbits import OrbitError, critical_belt_speeds, first_lyapunov_coefficient, limit_cycle
-from sd_friction_env.parameters import FRICTIONS, GEOMETRIES, RANGES, OscillatorParameters
+from sd_friction_env.parameters import FIELDS, FRICTIONS, GEOMETRIES, RANGES, OscillatorParameters
 from sd_friction_env.policies import Policy, VelocityFeedback, ZeroPolicy, load_policy
 from sd_friction_env.pretrained import load_pretrained
 from sd_friction_env.rendering import checked_size
+from sd_friction_env.rigs import read_rig
 from sd_friction_env.simulation import simulate
 from sd_friction_env.storage import atomic_file, checked_ending
 from sd_friction_env.tables import Table
 
 FAILURE, BAD_USAGE, INTERRUPTED = 1, 2, 130
 
-_FIELDS = {
-    "alpha": "height of the spring's anchor over the belt, H/L",
-    "g1": "weight, g/(L omega0^2)",
-    "beta": "damping ratio",
-    "mu_s": "static friction coefficient",
-    "mu_m": "least kinetic friction coefficient",
-    "v_m": "relative speed of least friction",
-    "belt_speed": "belt speed v_b",
-}
-# Of other laws than the paper's.
+_SCALES = ("time_scale", "length_scale", "force_scale")
+_LAWS_OF_THE_PAPER = ("", "exact, cubic", "stribeck")
+_FIELDS = {name: field["meaning"] for name, field in FIELDS.items() if field["law"] in _LAWS_OF_THE_PAPER}
+_FIELDS = {name: meaning for name, meaning in _FIELDS.items() if name not in _SCALES}
 _LAW_FIELDS = {
-    "mu_k": "kinetic friction coefficient of coulomb and exponential",
-    "delta": "fall of the hyperbolic law, mu_s/(1 + delta |w|)",
-    "v_0": "speed of decay of the exponential law",
-    "mu_v": "viscous part of the exponential law",
-    "kappa": "stiffening of duffing, R = x + kappa x^3",
-    "force_amplitude": "exciting force",
-    "force_frequency": "its frequency, radians per unit of time",
-    "force_phase": "its phase, radians",
-    "ripple_amplitude": "ripple on the belt's speed",
-    "ripple_frequency": "its frequency",
-    "ripple_phase": "its phase",
-    "stiffness_amplitude": "modulation of the spring's force",
-    "stiffness_frequency": "its frequency",
-    "stiffness_phase": "its phase",
+    name: f"{field['meaning']} ({field['law']})"
+    for name, field in FIELDS.items()
+    if field["law"] not in _LAWS_OF_THE_PAPER
 }
 _MOST_POINTS = 10_000_000
 _TASKS = {"force": "Force", "belt": "BeltSpeed"}
@@ -126,10 +111,13 @@ def _command(
     parser = _bare_command(commands, name, run, summary, examples)
     parser.set_defaults(analysis=True)
     group = parser.add_argument_group("oscillator", "one or more values each, or start:stop:step; several make a grid")
-    group.add_argument("--geometry", nargs="+", choices=GEOMETRIES, default=["exact"], help="forces (default: exact)")
-    group.add_argument(
-        "--friction", nargs="+", choices=FRICTIONS, default=["stribeck"], help="law of friction (default: stribeck)"
-    )
+    group.add_argument("--geometry", nargs="+", choices=GEOMETRIES, help="spring (default: exact)")
+    laws = group.add_mutually_exclusive_group()
+    laws.add_argument("--friction", nargs="+", choices=FRICTIONS, help="law of friction (default: stribeck)")
+    text = "a measured friction curve: speeds and coefficients in two columns"
+    laws.add_argument("--friction-table", type=Path, metavar="FILE.csv", help=text)
+    text = "a rig in SI units, in TOML or YAML: M, K, C, ...; the options are dimensionless and change it"
+    group.add_argument("--rig", type=Path, metavar="FILE", help=text)
     nominal = OscillatorParameters()
     other = parser.add_argument_group("other laws, excitation", "likewise")
     for field, meaning in (_FIELDS | _LAW_FIELDS).items():
@@ -379,7 +367,11 @@ def parser() -> argparse.ArgumentParser:
 def _grid(options: argparse.Namespace, *, belt_speed: bool = True) -> list[tuple[dict[str, Any], OscillatorParameters]]:
     """Return what was swept, and the parameters, of each point of the grid; all are checked before any is computed."""
     fields = [name for name in _FIELDS | _LAW_FIELDS if belt_speed or name != "belt_speed"]
-    values: dict[str, list[Any]] = {"geometry": options.geometry, "friction": options.friction}
+    base = read_rig(options.rig) if options.rig else OscillatorParameters()
+    values: dict[str, list[Any]] = {"geometry": options.geometry or [base.geometry]}
+    values["friction"] = options.friction or [base.friction]
+    if options.friction_table:
+        values["friction"] = [friction_table(options.friction_table)]
     for name in fields:
         given = getattr(options, name)
         if given is not None:
@@ -391,7 +383,7 @@ def _grid(options: argparse.Namespace, *, belt_speed: bool = True) -> list[tuple
     for point in itertools.product(*values.values()):
         named = dict(zip(values, point, strict=True))
         swept = {name: value for name, value in named.items() if len(values[name]) > 1}
-        grid.append((swept, OscillatorParameters(**named)))
+        grid.append((swept, base.replace(**named)))
     return grid
 
 

@@ -13,7 +13,7 @@ from numba.core.dispatcher import Dispatcher
 
 import sd_friction_env
 from sd_friction_env import kernel
-from sd_friction_env.compilation import NO_FOLDER
+from sd_friction_env.kernel.compilation import NO_FOLDER
 from sd_friction_env.orbits import limit_cycle
 from sd_friction_env.parameters import OscillatorParameters
 from sd_friction_env.policies import PolicyFileError
@@ -105,10 +105,10 @@ def _agent_fault(env_id: str) -> str:
 
 def _cache() -> dict[str, Any]:
     """Return where numba keeps what it compiled of ours: the folder it uses, or None and the reason."""
-    is_compiled = isinstance(kernel.settle, Dispatcher)
-    folder = kernel.settle.stats.cache_path if is_compiled else None
+    is_compiled = isinstance(kernel.iterate_to_attractor, Dispatcher)
+    folder = kernel.iterate_to_attractor.stats.cache_path if is_compiled else None
     reason = NO_FOLDER if is_compiled else "nothing is compiled: NUMBA_DISABLE_JIT is set"
-    files = list(Path(folder).glob("kernel.*.nb[ic]")) if folder is not None else []
+    files = list(Path(folder).glob("*.nb[ic]")) if folder is not None else []
     return {
         "folder": folder,
         "reason": "" if folder is not None else reason,

@@ -20,8 +20,8 @@ from sd_friction_env import kernel
 from sd_friction_env.orbits import stick_intervals
 from sd_friction_env.parameters import (
     EXCITATIONS,
-    FRICTION_CODES,
-    GEOMETRY_CODES,
+    FRICTIONS,
+    GEOMETRIES,
     STATE_LIMIT,
     OscillatorParameters,
     brief_repr,
@@ -160,8 +160,8 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
     |---|---|---|
     | `mode` | -1, 0, 1 | slips slower than the belt, sticks, slips faster than the belt |
     | `status` | 0, 1, 2, 3 | ok, contact lost, event limit, step limit (`kernel.STATUS_NAMES`) |
-    | `parameters`: `geometry` | 0, 1, 2, 3 | exact, cubic, linear, duffing (`parameters.GEOMETRIES`) |
-    | `parameters`: `friction` | 0, 1, 2, 3 | stribeck, coulomb, hyperbolic, exponential (`parameters.FRICTIONS`) |
+    | `parameters`: `geometry` | 0 to 3, -1 | place in `parameters.GEOMETRIES`; one of your own |
+    | `parameters`: `friction` | 0 to 4, -1 | place in `parameters.FRICTIONS`; one of your own |
 
     `env.unwrapped.parameters` are the episode's :class:`OscillatorParameters` themselves.
 
@@ -243,12 +243,11 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         self._window: collections.deque[tuple[float, float, float]] = collections.deque(maxlen=READOUT_INTERVALS)
         self._mode = kernel.STICK
         self._force = 0.0
+        self._memory = np.zeros(kernel.memory_size(task.sensor_delay, shows))
+        self._observations = np.zeros((1, 1 + sees + shows), np.float32)
         numbers, codes = task_arrays(self.task)
-        past = 2 * (task.sensor_delay + 1) if task.sensor_delay else 0
-        self._memory = np.zeros(len(numbers) + len(codes) + kernel.INTEGER_ROWS + kernel.STATE_ROWS + past + shows)
         self._memory[: len(numbers)] = numbers
         self._memory[len(numbers) : len(numbers) + len(codes)].view(np.int64)[:] = codes
-        self._observations = np.zeros((1, 1 + sees + shows), np.float32)
         self._look_into_memory()
         self._use(self.nominal)
 
@@ -256,16 +255,6 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
     def from_rig(
         cls,
         *,
-        M: float,
-        K: float,
-        C: float,
-        L: float,
-        H: float,
-        g: float,
-        V0: float,
-        mu_s: float,
-        mu_m: float,
-        V_m: float,
         sampling_time: float,
         force_limit: float | None = None,
         belt_acceleration_limit: float | None = None,
@@ -274,36 +263,40 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         """Return an environment made from a rig in SI units.
 
         Args:
-            M, K, C, L, H, g, V0, mu_s, mu_m, V_m: as :meth:`OscillatorParameters.from_physical` has them.
             sampling_time: the control interval, s.
             force_limit: greatest control force, N. belt_acceleration_limit: of the belt, m/s^2.
-            **arguments: any other argument of the class.
+            **arguments: the rig, as :meth:`OscillatorParameters.from_physical` takes it (M, K, C, L, H, g, V0, the
+                laws and their numbers), and any other argument of the class.
 
         ``env.unwrapped.nominal.time_scale`` (seconds), ``length_scale`` (metres) and ``force_scale`` (newtons) lead
         back to SI units.
         """
-        parameters = OscillatorParameters.from_physical(M, K, C, L, H, g, V0, mu_s, mu_m, V_m)
+        own = {*Task.field_names(), "render_mode", "render_size", "reward"}
+        parameters = OscillatorParameters.from_physical(
+            **{name: value for name, value in arguments.items() if name not in own}
+        )
         rig = rig_arguments(
             parameters,
             sampling_time=sampling_time,
             force_limit=force_limit,
             belt_acceleration_limit=belt_acceleration_limit,
         )
-        return cls(parameters, **rig, **arguments)
+        return cls(parameters, **rig, **{name: value for name, value in arguments.items() if name in own})
 
     def _look_into_memory(self) -> None:
-        arrays = kernel.arrays_in(self._memory)
-        self._numbers, self._codes, self._state, self._integers, self._past, self._shown = arrays
+        arrays = kernel.arrays_in(self._memory, 0)
+        self._numbers, self._codes, self._counts = arrays.task, arrays.codes, arrays.counts
+        self._state, self._past, self._shown = arrays.state, arrays.past, arrays.shown
         self._seen = self._observations[0]
 
     def __getstate__(self) -> dict[str, Any]:
-        views = ("_numbers", "_codes", "_state", "_integers", "_past", "_shown", "_seen", "_step_alone")
+        views = ("_numbers", "_codes", "_state", "_counts", "_past", "_shown", "_seen", "_steppers", "_step_one")
         return {name: value for name, value in vars(self).items() if name not in views}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._look_into_memory()  # a copied view would look into no one's memory
-        self._choose_step()
+        self._choose_stepper()
 
     @property
     def parameters(self) -> OscillatorParameters:
@@ -313,22 +306,27 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
     def _use(self, parameters: OscillatorParameters) -> None:
         """Begin anew with these parameters, the belt at its nominal speed."""
         self._parameters = parameters
-        geometry, *numbers, _ = parameters.plant
-        self._choose_step()
-        self._integers[kernel.I_GEOMETRY] = geometry
-        self._state[: kernel.S_BELT_SPEED, 0] = numbers
-        self._state[kernel.S_BELT_SPEED] = parameters.belt_speed
-        self._state[kernel.S_FRICTION : kernel.STATE_ROWS, 0] = parameters.laws(0.0)[1:-1]
-        kernel.blank_episodes(self._state, self._integers, (0,))
-        if self.task.show_parameters:
-            self._shown[0] = self.task.shown_parameters(dataclasses.asdict(parameters))
+        self._choose_stepper()
+        plant = self._plant()
+        task = self.task
+        head = kernel.memory_size(task.sensor_delay, len(task.randomise) if task.show_parameters else 0)
+        self._memory = np.concatenate((self._memory[:head], kernel.leaves_of(plant), kernel.tables_of(plant)))
+        self._look_into_memory()
+        self._state[kernel.STATE_BELT_SPEED] = parameters.belt_speed
+        kernel.blank_episodes(self._state, self._counts, (0,))
+        if task.show_parameters:
+            self._shown[0] = task.shown_parameters(parameters.values)
 
-    def _choose_step(self) -> None:
-        self._step_alone = kernel.step_alone_beyond if self._parameters.beyond else kernel.step_alone
+    def _plant(self) -> kernel.Plant:
+        # Phases that are shown are those of an excitation, even of one that is too small to be seen.
+        return self._parameters.excited_plant(0.0) if self.task.show_phases else self._parameters.plant
+
+    def _choose_stepper(self) -> None:
+        self._steppers = kernel.steppers(self._plant())
+        self._step_one = self._steppers.step_one
 
     def _observe(self) -> NDArray[np.float32]:
-        arrays = (self._numbers, self._codes, self._state, self._integers, self._past, self._shown)
-        kernel.observe(*arrays, self._observations, (0,))
+        self._steppers.observe_alone(self._memory, self._observations)
         seen: NDArray[np.float32] = self._seen.copy()
         return seen
 
@@ -341,7 +339,7 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
             TypeError, ValueError: if an option is unknown or out of its range; the running episode is then untouched.
         """
         options = checked_options(options)
-        key, episode = self._key, int(self._integers[kernel.I_EPISODE, 0]) + 1
+        key, episode = self._key, int(self._counts[kernel.COUNT_EPISODE, 0]) + 1
         if seed is not None or key is None:
             super().reset(seed=seed)
             key, episode = int(self.np_random.integers(2**62)), 0
@@ -353,11 +351,11 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
             check_belt(parameters)
         x, v = start_of(task, parameters, options, key, episode)
         self._key = key
-        self._codes[kernel.T_EPISODE_STEPS] = limit
-        self._codes[kernel.T_LATE_STEPS] = steps_before_last_quarter(limit)
+        self._codes[kernel.TASK_EPISODE_STEPS] = limit
+        self._codes[kernel.TASK_LATE_STEPS] = steps_before_last_quarter(limit)
         self._use(parameters)
-        self._integers[kernel.I_KEY], self._integers[kernel.I_EPISODE] = key, episode
-        self._state[kernel.S_X], self._state[kernel.S_V] = x, v
+        self._counts[kernel.COUNT_KEY], self._counts[kernel.COUNT_EPISODE] = key, episode
+        self._state[kernel.STATE_X], self._state[kernel.STATE_V] = x, v
         self._running = True
         self._mode, v_belt, v_rel, normal_force = kernel.left_alone(parameters.plant, x, v, parameters.belt_speed)
         self.clear_picture()
@@ -436,14 +434,14 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
             reward,
             terminated,
             truncated,
-        ) = self._step_alone(self._memory, self._observations, a)
+        ) = self._step_one(self._memory, self._observations, a)
         info["action"] = a
         if status != kernel.OK:
             self._running = False
             info["status"] = status
         if self.reward is not None:
             reward = float(self.reward(info))
-            self._state[kernel.S_RETURN] += reward
+            self._state[kernel.STATE_RETURN] += reward
         if self.render_mode is not None:
             self.note_mode(info["mode"])
             self.note_for_picture(info["x_min"], info["x_max"], info["stick_fraction"], info["force"])
@@ -451,7 +449,7 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
                 self.render()
         if terminated or truncated:
             values = np.empty((len(EPISODE_STATISTICS), 1))
-            kernel.episode_statistics(self._state, self._integers, (0,), self.reward is not None, values)
+            kernel.episode_statistics(self._state, self._counts, (0,), self.reward is not None, values)
             statistics = {name: value.item() for name, value in named_statistics(values).items()}
             info["statistics"] = statistics
             info.update((name, statistics[name]) for name in PLAIN_STATISTICS)
@@ -465,7 +463,7 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         """
         if self._key is None:
             raise gym.error.ResetNeeded("call reset() before get_state(): there is no state yet")
-        return read_state(self._parameters, self._state, self._integers, self._past, 0)
+        return read_state(self._parameters, self._state, self._counts, self._past, 0)
 
     def set_state(self, state: EnvState) -> None:
         """Go back to a state that :meth:`get_state` returned: what follows is the same, bit for bit.
@@ -477,11 +475,11 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         """
         checked_state("state", state)
         self._use(state.parameters)
-        write_state(state, self._state, self._integers, self._past, 0)
+        write_state(state, self._state, self._counts, self._past, 0)
         self._key = state.key
         self._running = not state.ended
-        plant = kernel.later(state.parameters.plant, state.steps * self.task.control_interval)
-        self._mode = kernel.mode_of(plant, state.x, state.v, state.v_belt, 0.0, 0.0)
+        plant = kernel.at_time(state.parameters.plant, state.steps * self.task.control_interval)
+        self._mode = kernel.mode_of(plant, kernel.State(state.x, state.v), kernel.Drive(state.v_belt, 0.0, 0.0))
 
     def note_for_picture(self, x_min: float, x_max: float, stick_fraction: float, force: float) -> None:
         """Remember what an interval came to for the readouts of :meth:`render`."""
@@ -519,14 +517,14 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         if self._renderer is None:
             self._renderer = Renderer(self.render_mode, *self.render_size, fps=self.metadata["render_fps"])
         p, task = self._parameters, self.task
-        x, v, v_belt, belt_travel = self._state[kernel.S_X : kernel.S_TRAVEL + 1, 0].tolist()
+        x, v, v_belt, belt_travel = self._state[kernel.STATE_X : kernel.STATE_TRAVEL + 1, 0].tolist()
         intervals = stick_intervals(p.unexcited.replace(belt_speed=v_belt)) if v_belt >= 0.0 else []
         interval = min(intervals, key=lambda ends: abs(0.5 * (ends[0] + ends[1]) - x), default=None)
         lows, highs, sticks = zip(*self._window, strict=True) if self._window else ((x,), (x,), (0.0,))
         by_belt = task.belt_authority * p.belt_speed if task.actuator == "belt_speed" else 0.0
         return self._renderer.draw(
             Scene(
-                time=int(self._integers[kernel.I_STEPS, 0]) * task.control_interval,
+                time=int(self._counts[kernel.COUNT_STEPS, 0]) * task.control_interval,
                 x=x,
                 v=v,
                 v_belt=v_belt,
@@ -555,33 +553,42 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
 def task_arrays(task: Task) -> tuple[FloatArray, IntegerArray]:
     """Return what compiled code needs of a task: numbers and codes, as the kernel names their places."""
     numbers = np.zeros(kernel.TASK_NUMBERS)
-    numbers[kernel.T_AUTHORITY] = task.authority
-    numbers[kernel.T_A_LIMIT] = task.belt_acceleration_limit
-    numbers[kernel.T_INTERVAL] = task.control_interval
-    numbers[kernel.T_W_EFFORT] = task.w_effort
-    numbers[kernel.T_W_STICK] = task.w_stick
-    numbers[kernel.T_CONTACT_LOSS_COST] = task.contact_loss_cost
-    numbers[kernel.T_LIMIT] = task.observation_limit
-    numbers[kernel.T_X_OFFSET] = task.x_offset
-    numbers[kernel.T_X_SCALE] = task.x_scale
-    numbers[kernel.T_V_SCALE] = task.v_scale
-    numbers[kernel.T_BELT_AUTHORITY] = task.belt_authority or 1.0
-    numbers[kernel.T_SENSOR_NOISE] = task.sensor_noise
+    numbers[kernel.TASK_AUTHORITY] = task.authority
+    numbers[kernel.TASK_A_LIMIT] = task.belt_acceleration_limit
+    numbers[kernel.TASK_INTERVAL] = task.control_interval
+    numbers[kernel.TASK_W_EFFORT] = task.w_effort
+    numbers[kernel.TASK_W_STICK] = task.w_stick
+    numbers[kernel.TASK_CONTACT_LOSS_COST] = task.contact_loss_cost
+    numbers[kernel.TASK_LIMIT] = task.observation_limit
+    numbers[kernel.TASK_X_OFFSET] = task.x_offset
+    numbers[kernel.TASK_X_SCALE] = task.x_scale
+    numbers[kernel.TASK_V_SCALE] = task.v_scale
+    numbers[kernel.TASK_BELT_AUTHORITY] = task.belt_authority or 1.0
+    numbers[kernel.TASK_SENSOR_NOISE] = task.sensor_noise
     codes = np.zeros(kernel.TASK_CODES, np.int64)
-    codes[kernel.T_ACTUATOR] = ACTUATOR_CODES[task.actuator]
-    codes[kernel.T_EPISODE_STEPS] = task.episode_steps
-    codes[kernel.T_LATE_STEPS] = task.late_steps
-    codes[kernel.T_FULL_STATE] = task.sensor == "state"
-    codes[kernel.T_SEES_BELT] = task.sensor == "state" and task.actuator == "belt_speed"
-    codes[kernel.T_SENSOR_DELAY] = task.sensor_delay
-    codes[kernel.T_SEES_PHASES] = task.show_phases
+    codes[kernel.TASK_ACTUATOR] = ACTUATOR_CODES[task.actuator]
+    codes[kernel.TASK_EPISODE_STEPS] = task.episode_steps
+    codes[kernel.TASK_LATE_STEPS] = task.late_steps
+    codes[kernel.TASK_FULL_STATE] = task.sensor == "state"
+    codes[kernel.TASK_SEES_BELT] = task.sensor == "state" and task.actuator == "belt_speed"
+    codes[kernel.TASK_SENSOR_DELAY] = task.sensor_delay
+    codes[kernel.TASK_SEES_PHASES] = task.show_phases
+    codes[kernel.TASK_TRAVEL] = True
+    codes[kernel.TASK_SHOWS] = len(task.randomise) if task.show_parameters else 0
     return numbers, codes
 
 
 def numbers_of(parameters: OscillatorParameters) -> dict[str, float]:
     """Return parameters as info has them: geometry and friction by their places in GEOMETRIES and FRICTIONS."""
-    codes = {"geometry": GEOMETRY_CODES[parameters.geometry], "friction": FRICTION_CODES[parameters.friction]}
-    return dataclasses.asdict(parameters) | codes
+    return parameters.values | {
+        "geometry": place_of(parameters.geometry, GEOMETRIES),
+        "friction": place_of(parameters.friction, FRICTIONS),
+    }
+
+
+def place_of(law: Any, names: tuple[str, ...]) -> int:
+    """Return the place of a law among the names, -1 for one of a user's own."""
+    return names.index(law) if isinstance(law, str) else -1
 
 
 def named_statistics(values: FloatArray) -> dict[str, NDArray[Any]]:
@@ -596,30 +603,36 @@ def read_state(
 ) -> EnvState:
     """Return the state of environment ``i``; arrays as the kernel has them."""
     counts = integers[:, i].tolist()
-    memory, seen = len(past), counts[kernel.I_SEEN]
+    memory, seen = len(past), counts[kernel.COUNT_SEEN]
     return EnvState(
         parameters=parameters,
-        x=float(state[kernel.S_X, i]),
-        v=float(state[kernel.S_V, i]),
-        v_belt=float(state[kernel.S_BELT, i]),
-        belt_travel=float(state[kernel.S_TRAVEL, i]),
-        steps=counts[kernel.I_STEPS],
-        ended=counts[kernel.I_OVER] == kernel.ENDED,
-        worst_cost=float(state[kernel.S_WORST, i]),
-        key=counts[kernel.I_KEY],
-        episode=counts[kernel.I_EPISODE],
+        x=float(state[kernel.STATE_X, i]),
+        v=float(state[kernel.STATE_V, i]),
+        v_belt=float(state[kernel.STATE_BELT, i]),
+        belt_travel=float(state[kernel.STATE_TRAVEL, i]),
+        steps=counts[kernel.COUNT_STEPS],
+        ended=counts[kernel.COUNT_OVER] == kernel.ENDED,
+        worst_cost=float(state[kernel.STATE_WORST, i]),
+        key=counts[kernel.COUNT_KEY],
+        episode=counts[kernel.COUNT_EPISODE],
         past=tuple(tuple(past[k % memory, :, i].tolist()) for k in range(max(0, seen - memory), seen)),
     )
 
 
 def write_state(saved: EnvState, state: FloatArray, integers: IntegerArray, past: FloatArray, i: int) -> None:
     """Put what :func:`read_state` returned into the arrays of environment ``i``, an episode that has just begun."""
-    state[kernel.S_X : kernel.S_WORST + 1, i] = (saved.x, saved.v, saved.v_belt, saved.belt_travel, saved.worst_cost)
-    integers[kernel.I_KEY, i], integers[kernel.I_EPISODE, i] = saved.key, saved.episode
-    integers[kernel.I_STEPS, i] = integers[kernel.I_FIRST_STEP, i] = saved.steps
-    integers[kernel.I_OVER, i] = kernel.ENDED if saved.ended else kernel.RUNNING
+    state[kernel.STATE_X : kernel.STATE_WORST + 1, i] = (
+        saved.x,
+        saved.v,
+        saved.v_belt,
+        saved.belt_travel,
+        saved.worst_cost,
+    )
+    integers[kernel.COUNT_KEY, i], integers[kernel.COUNT_EPISODE, i] = saved.key, saved.episode
+    integers[kernel.COUNT_STEPS, i] = integers[kernel.COUNT_FIRST_STEP, i] = saved.steps
+    integers[kernel.COUNT_OVER, i] = kernel.ENDED if saved.ended else kernel.RUNNING
     if len(past):
-        integers[kernel.I_SEEN, i] = min(len(saved.past), len(past))  # a longer memory's oldest are left out
+        integers[kernel.COUNT_SEEN, i] = min(len(saved.past), len(past))  # a longer memory's oldest are left out
         for k, pair in enumerate(saved.past[-len(past) :]):
             past[k, :, i] = pair
 

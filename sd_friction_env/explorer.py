@@ -26,7 +26,7 @@ from sd_friction_env.basins import basin_grid
 from sd_friction_env.curves import amplitude_curve
 from sd_friction_env.env import SDFrictionEnv
 from sd_friction_env.orbits import LimitCycle, OrbitError, limit_cycle
-from sd_friction_env.parameters import FRICTIONS, GEOMETRIES, STATE_LIMIT, OscillatorParameters
+from sd_friction_env.parameters import FRICTIONS, GEOMETRIES, STATE_LIMIT, Kind, OscillatorParameters
 from sd_friction_env.plotting import BLACK, BLUE, GREEN, GREY, VERMILION
 from sd_friction_env.policies import ConstantPolicy, Policy, State, VelocityFeedback, ZeroPolicy
 from sd_friction_env.pretrained import load_pretrained
@@ -256,9 +256,10 @@ def passive_curve(
 
 
 @functools.cache
-def _compile_steps(is_beyond: bool) -> None:
+def _compile_steps(kind: Kind) -> None:
     """Compile what an episode of such plants calls, so that no page waits for it in the server's own thread."""
-    Live(parameters=OscillatorParameters(friction="coulomb" if is_beyond else "stribeck")).advance(1)
+    geometry, alpha = ("exact", 0.0) if kind.geometry == "discontinuous" else (kind.geometry, 0.8)
+    Live(parameters=OscillatorParameters(geometry=geometry, alpha=alpha, friction=kind.friction)).advance(1)
 
 
 @dataclass(frozen=True)
@@ -272,7 +273,7 @@ class PlantPicture:
     @classmethod
     def of(cls, parameters: OscillatorParameters) -> "PlantPicture":
         """Compute it."""
-        _compile_steps(parameters.beyond)
+        _compile_steps(parameters.unexcited.kind)
         return cls(parameters, passive_curve(parameters), passive_cycle(parameters))
 
 

@@ -191,13 +191,13 @@ def _checked_phase(phase: float) -> float:
 def _checked_start(parameters: OscillatorParameters, x: float, v: float | None, time: float) -> tuple[float, float]:
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
     if v is None:
-        return x, float(kernel.room_v(_plant(parameters, time), parameters.belt_speed))
+        return x, float(_plant(parameters, time).excitation.lab_velocity(parameters.belt_speed))
     return x, checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
 
 
 def _plant(parameters: OscillatorParameters, time: float = 0.0) -> kernel.Plant:
     # Always the general form of the kernel, so that one form of what is here is compiled.
-    return parameters.plant._replace(laws=parameters.laws(time))
+    return parameters.excited_plant(time)
 
 
 def _lost(parameters: OscillatorParameters, x: float, v: float, status: int, cycle: int) -> OrbitError:
@@ -264,14 +264,14 @@ def poincare_section(
     rows, _, _ = _followed(parameters, state, period, phase, transient, cycles, growing=False)
     columns: dict[str, Any] = {
         "cycle": np.arange(transient, transient + cycles),
-        "x": rows[:, kernel.R_X],
-        "v": rows[:, kernel.R_V],
-        "mode": rows[:, kernel.R_MODE].astype(np.int8),
-        "stick_fraction": rows[:, kernel.R_STICK_TIME] / period,
-        "sticks": rows[:, kernel.R_STICKS].astype(np.int64),
-        "forward_arcs": rows[:, kernel.R_FORWARD_ARCS].astype(np.int64),
-        "x_min": rows[:, kernel.R_X_MIN],
-        "x_max": rows[:, kernel.R_X_MAX],
+        "x": rows[:, kernel.CYCLE_X],
+        "v": rows[:, kernel.CYCLE_V],
+        "mode": rows[:, kernel.CYCLE_MODE].astype(np.int8),
+        "stick_fraction": rows[:, kernel.CYCLE_STICK_TIME] / period,
+        "sticks": rows[:, kernel.CYCLE_STICKS].astype(np.int64),
+        "forward_arcs": rows[:, kernel.CYCLE_FORWARD_ARCS].astype(np.int64),
+        "x_min": rows[:, kernel.CYCLE_X_MIN],
+        "x_max": rows[:, kernel.CYCLE_X_MAX],
     }
     return Table(columns, {"parameters": dataclasses.asdict(parameters), "period": period, "phase": phase})
 
@@ -343,7 +343,7 @@ def _lap(
     """Return what the kernel's walk does over ``multiple`` cycles, and the tangent map (2, 2)."""
     vectors = np.eye(2)
     events = np.empty((kernel.MAX_EVENTS, 4))
-    end = kernel.walk(
+    end = kernel.integrate_with_tangents(
         _plant(parameters, phase * period),
         *state,
         parameters.belt_speed,
@@ -363,7 +363,7 @@ def _closed(
     for _ in range(_NEWTON_STEPS):
         place = float(start[0]), float(start[1])
         end, tangent = _lap(parameters, place, multiple, period, phase, in_sections=False)
-        if end[3] != kernel.OK:
+        if end.status != kernel.OK:
             return None
         error = np.array(end[:2]) - start
         if np.abs(error).max() < _CONVERGED:
@@ -383,8 +383,7 @@ def _closed(
     for divisor in range(1, multiple):
         if multiple % divisor == 0 and np.abs(points[divisor] - start).max() < 10.0 * _CONVERGED:
             return _closed(parameters, place, divisor, period, phase)
-    _, _, _, _, duration, stick_time, sticks, forward_arcs, x_min, x_max, stuck, singular = end
-    if stuck:
+    if end.ever_stuck:
         first, second = complex(np.trace(tangent)), 0j
     else:
         first, second = sorted((complex(m) for m in np.linalg.eigvals(tangent)), key=abs, reverse=True)
@@ -395,15 +394,15 @@ def _closed(
         v=place[1],
         phase=phase,
         points=points,
-        amplitude=amplitude(x_min, x_max),
-        x_min=x_min,
-        x_max=x_max,
-        stick_fraction=stick_time / duration,
-        sticks=sticks,
-        forward_arcs=forward_arcs,
+        amplitude=amplitude(end.x_min, end.x_max),
+        x_min=end.x_min,
+        x_max=end.x_max,
+        stick_fraction=end.stick_time / end.time,
+        sticks=end.sticks,
+        forward_arcs=end.forward_arcs,
         multipliers=(first, second),
         stable=abs(first) < 1.0,
-        singular_events=singular,
+        singular_events=end.singular_events,
         parameters=parameters,
     )
 
@@ -460,8 +459,8 @@ def _exponent_of(
         exponents=(max(first, second), min(first, second)),
         cycles=len(rows),
         singular_events=singular,
-        x=float(rows[-1, kernel.R_X]),
-        v=float(rows[-1, kernel.R_V]),
+        x=float(rows[-1, kernel.CYCLE_X]),
+        v=float(rows[-1, kernel.CYCLE_V]),
         parameters=parameters,
     )
 
@@ -590,7 +589,7 @@ def _section_at(
         if period > 0.0:
             rows, growth, singular = _followed(plant, state, period, 0.0, transient, cycles, growing=lyapunov)
             exponent = _exponent_of(plant, rows, growth, period, singular) if lyapunov else None
-            xs, vs, stuck = rows[:, kernel.R_X], rows[:, kernel.R_V], rows[:, kernel.R_STICK_TIME] / period
+            xs, vs, stuck = rows[:, kernel.CYCLE_X], rows[:, kernel.CYCLE_V], rows[:, kernel.CYCLE_STICK_TIME] / period
         else:
             places = np.empty(transient + cycles)
             status, written = kernel.maxima(_plant(plant), *state, plant.belt_speed, places, traps_of(plant))
@@ -668,7 +667,7 @@ def forced_basins(
         plant = _plant(parameters, phase * period)
 
         def part(one: slice) -> None:
-            kernel.reach(
+            kernel.label_attractors(
                 plant,
                 moved_x[one],
                 moved_v[one],

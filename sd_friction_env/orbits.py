@@ -34,6 +34,9 @@ _STEP_ERROR = 1e-9  # promised of the steps, per unit of time
 _LARGEST_DOUBTED = 1e-5  # radius up to which that error may hide what a lap does
 _LARGEST_SMALL = 1e-2  # radius about an equilibrium up to which its Hopf normal form holds
 _MOST_SETTLINGS, _MOST_LAPS = 200, 2000
+_FRICTION_SPEEDS = np.geomspace(1e-6, 100.0, 200).tolist()  # at which it is seen whether friction falls
+_LEAST_WIDTH = 0.1  # over which a law changes that names no width
+_OWN_SPRING_REACH = 10.0  # |x| up to which balance points of a spring of one's own are looked for
 _LEVEL, _LEVEL_STEP = 1e-9, 1e-4  # where a spring's stiffness is less, the force this far away says more
 _BELT_SPEED_ERROR = 1e-11  # v_b0 is given this much too low: on the very graze rounding decides whether a cycle sticks
 
@@ -154,12 +157,12 @@ def balance_points(parameters: OscillatorParameters, load: float, coefficient: f
     alpha, g1 = parameters.alpha, parameters.g1
     if parameters.geometry == "linear":
         return [coefficient * g1 - load]
-    if parameters.geometry_code == kernel.DISCONTINUOUS:
+    if parameters.discontinuous:
         # Where the jump of R at x = 0 passes the balance there is no place to stand on: see `stick_intervals` for that.
         push = coefficient * g1 - load
         return sorted(push + side for side in (-1.0, 1.0) if (push + side) * side > 0.0)
     if parameters.geometry == "duffing":
-        polynomial = [parameters.kappa, 0.0, 1.0, load - coefficient * g1]
+        polynomial = [parameters.kappa, 0.0, parameters.linear_stiffness, load - coefficient * g1]
     elif parameters.geometry == "cubic":
         square = alpha * alpha
         polynomial = [
@@ -168,21 +171,22 @@ def balance_points(parameters: OscillatorParameters, load: float, coefficient: f
             1.0 - 1.0 / alpha,
             load - coefficient * (g1 - alpha + 1.0),
         ]
+    elif parameters.geometry != "exact":
+        return _balance_points_of_own_spring(parameters.plant, load, coefficient)
     else:
         # (x - c) s = x + d with s = sqrt(x^2 + alpha^2); squared, a quartic with foreign roots among its own
         c, d, square = coefficient * (g1 - alpha) - load, coefficient * alpha, alpha * alpha
         polynomial = [1.0, -2.0 * c, c * c + square - 1.0, -2.0 * (c * square + d), c * c * square - d * d]
-    plant = parameters.plant
+    spring = parameters.plant.spring
     points: list[float] = []
     for root in np.roots(polynomial).tolist():
         if abs(root.imag) > 1e-6 * max(1.0, abs(root.real)):
             continue
         x = root.real
         for _ in range(8):
-            restoring, normal = kernel.spring(plant, x)
+            restoring, normal = spring.restoring_force(x), spring.normal_force(g1, x)
             error = load + restoring - coefficient * normal
-            restoring_slope, normal_slope = kernel.spring_slopes(plant, x)
-            slope = restoring_slope - coefficient * normal_slope
+            slope = spring.restoring_slope(x) - coefficient * spring.normal_slope(x)
             if slope == 0.0:
                 break
             x -= error / slope
@@ -196,8 +200,26 @@ def balance_points(parameters: OscillatorParameters, load: float, coefficient: f
     return sorted(points)
 
 
+def _balance_points_of_own_spring(plant: kernel.Plant, load: float, coefficient: float) -> list[float]:
+    """Return the roots within ``_OWN_SPRING_REACH``, on an even grid: two that are closer than its step are missed."""
+
+    def error(x: float) -> float:
+        return float(load + plant.spring.restoring_force(x) - coefficient * plant.spring.normal_force(plant.g1, x))
+
+    places = np.linspace(-_OWN_SPRING_REACH, _OWN_SPRING_REACH, 4001).tolist()
+    values = [error(x) for x in places]
+    points = [x for x, value in zip(places, values, strict=True) if value == 0.0]
+    for (low, high), (first, last) in zip(itertools.pairwise(places), itertools.pairwise(values), strict=True):
+        if first * last < 0.0:
+            points.append(root(error, low, high))
+    return sorted(points)
+
+
 def rest_place(parameters: OscillatorParameters) -> float:
     """Return where the unloaded spring has its (right-hand) place of rest, R(x) = 0 with R'(x) > 0."""
+    if parameters.geometry not in ("exact", "cubic", "linear"):
+        spring = parameters.plant.spring
+        return max((x for x in balance_points(parameters, 0.0, 0.0) if spring.restoring_slope(x) > 0.0), default=0.0)
     wells = {"exact": exact_wells, "cubic": cubic_wells}.get(parameters.geometry)  # alpha = 0 has its own at 1
     return wells(parameters.alpha)[-1] if wells else 0.0
 
@@ -216,11 +238,10 @@ def equilibria(parameters: OscillatorParameters) -> list[Equilibrium]:
     slope = float(kernel.friction_slope(plant, kernel.SLIP_BACKWARD, -speed))
     found = []
     for x in balance_points(parameters, 0.0, coefficient):
-        normal = kernel.spring(plant, x)[1]
+        normal = kernel.normal_force(plant, x)
         if normal <= 0.0:
             continue
-        restoring_slope, normal_slope = kernel.spring_slopes(plant, x)
-        stiffness = restoring_slope - coefficient * normal_slope
+        stiffness = plant.spring.restoring_slope(x) - coefficient * plant.spring.normal_slope(x)
         damping = 2.0 * parameters.beta + normal * slope
         root = cmath.sqrt(damping * damping - 4.0 * stiffness)
         pair = (0.5 * (-damping + root), 0.5 * (-damping - root))
@@ -243,20 +264,19 @@ def conserves_energy(parameters: OscillatorParameters) -> bool:
     return parameters.beta == 0.0 and _friction_is_level(parameters)
 
 
+def _friction_slopes(parameters: OscillatorParameters) -> list[float]:
+    friction = parameters.plant.friction
+    return [friction.slope(mode, mode * speed) for mode in (-1, 1) for speed in _FRICTION_SPEEDS]
+
+
 def _friction_is_level(parameters: OscillatorParameters) -> bool:
     """Whether friction in slip does not change with speed."""
-    law, mu_s = parameters.friction, parameters.mu_s
-    if law == "stribeck":
-        return mu_s == parameters.mu_m
-    if law == "hyperbolic":
-        return parameters.delta == 0.0 or mu_s == 0.0
-    return law == "coulomb" or (mu_s == parameters.mu_k and parameters.mu_v == 0.0)
+    return all(slope == 0.0 for slope in _friction_slopes(parameters))
 
 
 def _slip_dissipates(parameters: OscillatorParameters) -> bool:
     """Whether every slip contracts: damping, and friction that nowhere falls with speed. Then no slip is a cycle."""
-    rising = parameters.friction == "exponential" and parameters.mu_s == parameters.mu_k
-    return (rising or _friction_is_level(parameters)) and not conserves_energy(parameters)
+    return all(slope >= 0.0 for slope in _friction_slopes(parameters)) and not conserves_energy(parameters)
 
 
 @functools.lru_cache(maxsize=256)
@@ -302,7 +322,10 @@ def is_centre(parameters: OscillatorParameters, equilibrium: Equilibrium) -> boo
         return equilibrium.stiffness > 0.0
     plant, belt, x = parameters.plant, parameters.belt_speed, equilibrium.x
     left, right = (
-        kernel.slip_forces(plant, kernel.SLIP_BACKWARD, x + side * _LEVEL_STEP, 0.0, belt, 0.0)[0] for side in (-1, 1)
+        kernel.slip_acceleration(
+            plant, kernel.SLIP_BACKWARD, kernel.State(x + side * _LEVEL_STEP, 0.0), kernel.Drive(belt, 0.0, 0.0)
+        )
+        for side in (-1, 1)
     )
     return bool(left > 0.0 > right)
 
@@ -331,7 +354,7 @@ def limit_of_motion(parameters: OscillatorParameters, x: float, v: float) -> Lim
     laps = kernel.SETTLING_LAPS
     conserved, traps = conserves_energy(parameters), traps_of(parameters)
     for _ in range(_MOST_SETTLINGS):
-        outcome, place, previous, lowest = kernel.settle(
+        outcome, place, previous, lowest = kernel.iterate_to_attractor(
             parameters.plant, parameters.belt_speed, at_x, at_v, laps, np.empty(kernel.SETTLING_EXITS), traps
         )
         if outcome == kernel.REPEATED_BREAKAWAY:
@@ -433,7 +456,7 @@ class ReturnMap:
         self.parameters, self.equilibrium, self.centre = parameters, centre, centre.x
         self.places = [e.x for e in equilibria(parameters)]
         right = [x for x in self.places if x > centre.x]
-        if parameters.geometry_code == kernel.DISCONTINUOUS and centre.x < 0.0:
+        if parameters.discontinuous and centre.x < 0.0:
             right.insert(0, 0.0)  # the spring's switch parts the wells
         self.farthest = right[0] - centre.x if right else math.inf
         self.traps = traps_of(parameters)
@@ -445,7 +468,9 @@ class ReturnMap:
         )
         if event != kernel.TURNING or not 0.0 < following - self.centre < self.farthest or not low <= self.centre:
             return None, math.nan
-        arcs = 0 if self.parameters.mu_s == 0.0 else forward_arcs  # without friction the belt's speed parts nothing
+        arcs = (
+            0 if self.parameters.plant.friction.breakaway_coefficient(-1) == 0.0 else forward_arcs
+        )  # without friction the belt's speed parts nothing
         return (bisect.bisect_left(self.places, low), arcs), float(following - self.centre - radius)
 
     def shift(self, radius: float, kind: LapKind | None) -> float:
@@ -784,14 +809,18 @@ def stick_intervals(parameters: OscillatorParameters) -> list[tuple[float, float
     """Return the intervals of x in which a mass can stick, |2 beta v_b + R(x)| <= mu_s N(x), in ascending order."""
     _check_unexcited(parameters)
     load = 2.0 * parameters.beta * parameters.belt_speed
-    ends = [x for side in (-1.0, 1.0) for x in balance_points(parameters, load, side * parameters.mu_s)]
-    if parameters.geometry_code == kernel.DISCONTINUOUS:
+    plant, belt = parameters.plant, kernel.Drive(parameters.belt_speed, 0.0, 0.0)
+    ends = [
+        x
+        for side in (-1, 1)
+        for x in balance_points(parameters, load, side * plant.friction.breakaway_coefficient(-side))
+    ]
+    if parameters.discontinuous:
         ends.append(0.0)  # the stick load jumps there, and an interval may end or be passed through
     ends.sort()
     intervals: list[tuple[float, float]] = []
     for low, high in itertools.pairwise(ends):
-        force, limit = kernel.stick_load(parameters.plant, 0.5 * (low + high), parameters.belt_speed, 0.0, 0.0)
-        if abs(force) <= limit:
+        if kernel.mode_at_zero_v_rel(plant, 0.5 * (low + high), belt) == kernel.STICK:
             if intervals and intervals[-1][1] == low:
                 low = intervals.pop()[0]
             intervals.append((low, high))
@@ -836,7 +865,10 @@ def same_motion(a: LimitCycle, b: LimitCycle) -> bool:
     if a.kind != b.kind:
         return False
     if a.kind == "neutral":
-        places, arcs = [e.x for e in equilibria(a.parameters)], a.parameters.mu_s > 0.0
+        places, arcs = (
+            [e.x for e in equilibria(a.parameters)],
+            a.parameters.plant.friction.breakaway_coefficient(-1) > 0.0,
+        )
         first, second = (
             ([cycle.x_min <= x <= cycle.x_max for x in places], arcs and cycle.forward_arcs) for cycle in (a, b)
         )
@@ -846,27 +878,25 @@ def same_motion(a: LimitCycle, b: LimitCycle) -> bool:
 
 
 def _stick_slip(parameters: OscillatorParameters, x_exit: float, x: float, v: float) -> LimitCycle:
-    outcome, period, stick_time, x_min, x_max, x_restick, sticks, arcs, int_v2 = kernel.stick_slip_lap(
-        parameters.plant, parameters.belt_speed, x_exit
-    )
-    if outcome != kernel.REPEATED_BREAKAWAY:
+    lap = kernel.stick_slip_lap(parameters.plant, parameters.belt_speed, x_exit)
+    if lap.outcome != kernel.REPEATED_BREAKAWAY:
         raise OrbitError(f"the stick-slip cycle from breakaway at x = {x_exit!r} does not close; {parameters}")
     return LimitCycle(
         kind="stick-slip",
-        amplitude=amplitude(x_min, x_max),
-        period=period,
-        frequency=1.0 / period,
-        angular_frequency=2.0 * math.pi / period,
-        stick_fraction=stick_time / period,
-        x_max=x_max,
-        x_min=x_min,
-        mean_square_velocity=int_v2 / period,
+        amplitude=amplitude(lap.x_min, lap.x_max),
+        period=lap.period,
+        frequency=1.0 / lap.period,
+        angular_frequency=2.0 * math.pi / lap.period,
+        stick_fraction=lap.stick_time / lap.period,
+        x_max=lap.x_max,
+        x_min=lap.x_min,
+        mean_square_velocity=lap.int_v2 / lap.period,
         x_phase0=x_exit,
         v_phase0=parameters.belt_speed,
         x_breakaway=x_exit,
-        x_restick=x_restick,
-        sticks=sticks,
-        forward_arcs=arcs,
+        x_restick=lap.x_restick,
+        sticks=lap.sticks,
+        forward_arcs=lap.forward_arcs,
         floquet_multiplier=0.0,
         x_start=x,
         v_start=v,
@@ -884,8 +914,8 @@ def _pure_slip(
     if x_max - x_min < _SMALLEST_RADIUS:
         return _steady(parameters, "steady-slip" if kind == "pure-slip" else kind, x_max, x, v)
     step = 1e-4 * (x_max - x_min)
-    above = kernel.next_maximum(plant, speed, x_max + step, traps)[1]
-    below = kernel.next_maximum(plant, speed, x_max - step, traps)[1]
+    above = kernel.next_maximum(plant, speed, x_max + step, traps).x
+    below = kernel.next_maximum(plant, speed, x_max - step, traps).x
     multiplier = (above - below) / (2.0 * step)
     if math.isnan(multiplier):  # the orbit just above sticks
         multiplier = (x_max - below) / step
@@ -948,7 +978,7 @@ def hopf_belt_speed(parameters: OscillatorParameters) -> float:
         points = balance_points(parameters, 0.0, coefficient)
         if not points:
             return math.nan
-        normal = kernel.spring(plant, points[-1])[1]
+        normal = kernel.normal_force(plant, points[-1])
         return float(2.0 * parameters.beta + normal * kernel.friction_slope(plant, kernel.SLIP_BACKWARD, -speed))
 
     _check_unexcited(parameters)
@@ -970,8 +1000,8 @@ def _belt_speeds_to_search(parameters: OscillatorParameters) -> FloatArray:
     if parameters.friction == "coulomb":
         speeds = np.array([high, 0.0])  # level: it never feeds a motion
     else:
-        low = 1e-3 * (parameters.v_0 if parameters.friction == "exponential" else 1.0 / max(parameters.delta, 1e-3))
-        speeds = np.append(np.geomspace(high, min(low, 0.5 * high), 200), 0.0)
+        width = parameters.plant.friction.layer_width(-1) or _LEAST_WIDTH
+        speeds = np.append(np.geomspace(high, 1e-3 * min(width, 500.0 * high), 200), 0.0)
     return speeds
 
 
@@ -987,12 +1017,13 @@ def first_lyapunov_coefficient(parameters: OscillatorParameters) -> float:
         return math.nan
     at_hopf = parameters.replace(belt_speed=speed)
     plant, x = at_hopf.plant, equilibria(at_hopf)[-1].x
-    coefficient = float(kernel.friction_coefficient(plant, kernel.SLIP_BACKWARD, -speed))
-    slope = float(kernel.friction_slope(plant, kernel.SLIP_BACKWARD, -speed))
-    curvature, third = _friction_derivatives(at_hopf)
-    restoring_slope, normal_slope = kernel.spring_slopes(plant, x)
-    restoring_curvature, normal_curvature = kernel.spring_curvatures(plant, x)
-    normal = kernel.spring(plant, x)[1]
+    mode, w = kernel.SLIP_BACKWARD, -speed
+    friction, spring = plant.friction, plant.spring
+    coefficient, slope = friction.coefficient(mode, w), friction.slope(mode, w)
+    curvature, third = friction.curvature(mode, w), friction.third_derivative(mode, w)
+    restoring_slope, normal_slope = spring.restoring_slope(x), spring.normal_slope(x)
+    restoring_curvature, normal_curvature = spring.restoring_curvature(x), spring.normal_curvature(x)
+    normal = spring.normal_force(plant.g1, x)
     square = restoring_slope + coefficient * normal_slope  # omega^2
     f_xx = -restoring_curvature - coefficient * normal_curvature
     f_xv = -slope * normal_slope
@@ -1000,21 +1031,6 @@ def first_lyapunov_coefficient(parameters: OscillatorParameters) -> float:
     f_xxv = -slope * normal_curvature
     f_vvv = -third * normal
     return float((f_xxv + square * f_vvv + f_xv * f_xx / square + f_xv * f_vv) / 16.0)
-
-
-def _friction_derivatives(parameters: OscillatorParameters) -> tuple[float, float]:
-    """Return the second and third derivatives of mu at the relative velocity of steady slip, -v_b."""
-    speed = parameters.belt_speed
-    if parameters.friction == "stribeck":
-        return -6.0 * parameters.k3 * speed, 6.0 * parameters.k3
-    if parameters.friction == "hyperbolic":
-        delta, below = parameters.delta, 1.0 + parameters.delta * speed
-        return -2.0 * parameters.mu_s * delta**2 / below**3, -6.0 * parameters.mu_s * delta**3 / below**4
-    if parameters.friction == "exponential":
-        v_0 = parameters.v_0
-        fall = (parameters.mu_s - parameters.mu_k) * math.exp(-speed / v_0)
-        return -fall / v_0**2, -fall / v_0**3
-    return 0.0, 0.0
 
 
 def grazing_belt_speed(parameters: OscillatorParameters) -> float:
@@ -1026,8 +1042,8 @@ def grazing_belt_speed(parameters: OscillatorParameters) -> float:
     plant = parameters.plant
 
     def sticks_again(speed: float) -> bool:
-        ends = balance_points(parameters, 2.0 * parameters.beta * speed, parameters.mu_s)
-        if not ends or kernel.spring(plant, ends[-1])[1] <= 0.0:
+        ends = balance_points(parameters, 2.0 * parameters.beta * speed, plant.friction.breakaway_coefficient(-1))
+        if not ends or kernel.normal_force(plant, ends[-1]) <= 0.0:
             return False
         traps = traps_of(parameters.replace(belt_speed=speed))
         return bool(kernel.slip_returns_to_stick(plant, speed, ends[-1], traps))

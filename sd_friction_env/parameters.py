@@ -3,63 +3,37 @@
 import dataclasses
 import math
 import numbers
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Self, get_args
+from typing import Any, NamedTuple, Self
 
 from sd_friction_env import kernel
+from sd_friction_env.kernel import (
+    Coulomb,
+    Cubic,
+    Discontinuous,
+    Duffing,
+    Excitation,
+    Exponential,
+    Gaussian,
+    Hyperbolic,
+    Inclined,
+    Linear,
+    Plant,
+    ScaledFriction,
+    ScaledSpring,
+    Stribeck,
+    Unexcited,
+)
+from sd_friction_env.laws import checked_friction_law, checked_spring_law
 from sd_friction_env.theory import stribeck_coefficients
 
-Geometry = Literal["exact", "cubic", "linear", "duffing"]
-Friction = Literal["stribeck", "coulomb", "hyperbolic", "exponential"]
-
-GEOMETRIES: tuple[Geometry, ...] = get_args(Geometry)
-FRICTIONS: tuple[Friction, ...] = get_args(Friction)
-GEOMETRY_CODES = {"exact": kernel.EXACT, "cubic": kernel.CUBIC, "linear": kernel.LINEAR, "duffing": kernel.DUFFING}
-FRICTION_CODES = {
-    "stribeck": kernel.STRIBECK,
-    "coulomb": kernel.COULOMB,
-    "hyperbolic": kernel.HYPERBOLIC,
-    "exponential": kernel.EXPONENTIAL,
-}
+GEOMETRIES = ("exact", "cubic", "linear", "duffing")
+FRICTIONS = ("stribeck", "coulomb", "hyperbolic", "exponential", "gaussian")
 EXCITATIONS = ("force", "ripple", "stiffness")
 
 SMALLEST_ALPHA = 1e-3  # below it only 0, the discontinuous limit
-
-# What is accepted, both ends included.
-RANGES: dict[str, tuple[float, float]] = {
-    "alpha": (0.0, 10.0),
-    "g1": (1e-3, 100.0),
-    "beta": (0.0, 10.0),
-    "mu_s": (0.0, 10.0),
-    "mu_m": (0.0, 10.0),
-    "v_m": (1e-2, 100.0),
-    "belt_speed": (0.0, 10.0),
-    "time_scale": (1e-12, 1e12),
-    "length_scale": (1e-12, 1e12),
-    "force_scale": (1e-12, 1e18),
-    "mu_k": (0.0, 10.0),
-    "delta": (0.0, 1e3),
-    "v_0": (1e-3, 100.0),
-    "mu_v": (0.0, 10.0),
-    "kappa": (0.0, 10.0),
-    "force_amplitude": (0.0, 100.0),
-    "force_frequency": (1e-2, 1e3),
-    "force_phase": (-10.0, 10.0),
-    "ripple_amplitude": (0.0, 10.0),
-    "ripple_frequency": (1e-2, 1e3),
-    "ripple_phase": (-10.0, 10.0),
-    "stiffness_amplitude": (0.0, 1.0),
-    "stiffness_frequency": (1e-2, 1e3),
-    "stiffness_phase": (-10.0, 10.0),
-}
 STATE_LIMIT = 10.0  # |x| and |v| of a start
-
-
-def law_numbers(friction: str) -> tuple[str, ...]:
-    """Return which numbers a plant with this friction law has beyond the paper's, in the kernel's order."""
-    decay = "delta" if friction == "hyperbolic" else "v_0"
-    excitations = [f"{kind}_{what}" for kind in EXCITATIONS for what in ("amplitude", "frequency", "phase")]
-    return ("mu_k", decay, "mu_v", "kappa", *excitations)
 
 
 def checked_number(name: str, value: Any, low: float, high: float) -> float:
@@ -116,6 +90,13 @@ def checked_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
     return str(value)
 
 
+def _number(default: float, low: float, high: float, meaning: str, unit: str = "1", law: str = "") -> Any:
+    """Return a field of :class:`OscillatorParameters`: its default, range, meaning, unit, and the law that uses it."""
+    return dataclasses.field(
+        default=default, metadata={"range": (low, high), "meaning": meaning, "unit": unit, "law": law}
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class OscillatorParameters:
     """Parameters of the self-excited SD oscillator (dimensionless; defaults: the nominal plant).
@@ -127,7 +108,9 @@ class OscillatorParameters:
 
     Attributes:
         geometry: "exact" (R and N of Eq. 4), "cubic" (their Taylor polynomials, Eq. 9: what the paper's figures show),
-            "linear" (R = x, N = g1: the belt of Thomsen and Fidlin) or "duffing" (R = x + kappa x^3, N = g1).
+            "linear" (R = x, N = g1: the belt of Thomsen and Fidlin), "duffing" (R = linear_stiffness x + kappa x^3,
+            N = g1), or a spring
+            of your own (:func:`spring_law`).
         alpha: height of the spring's anchor over the belt, H/L, in [0.001, 10]; unused by "linear" and "duffing". With
             "exact" also 0, the discontinuous limit R = x - sgn(x), N = g1: x = 0 switches the spring's force, which a
             mass that moves meets as on the side it moves to, and one at rest there as 0.
@@ -141,13 +124,16 @@ class OscillatorParameters:
         length_scale: metres per unit of length, L (1 unless made by :meth:`from_physical`).
         force_scale: newtons per unit of force, K L (1 unless made by :meth:`from_physical`).
         friction: "stribeck" (Eq. 5, with mu_s, mu_m and v_m), "coulomb" (two levels: mu_s for stick, mu_k for slip),
-            "hyperbolic" (mu_s/(1 + delta |w|), w the relative velocity) or "exponential"
-            (mu_k + (mu_s - mu_k) exp(-|w|/v_0), and mu_v w).
-        mu_k: kinetic friction coefficient of "coulomb", least one of "exponential", in [0, mu_s] where used.
+            "hyperbolic" (mu_s/(1 + delta |w|) and mu_v w, w the relative velocity), "exponential"
+            (mu_k + (mu_s - mu_k) exp(-|w|/v_0), and mu_v w), "gaussian" (the same with exp(-(w/v_0)^2)), or a law of
+            its own: :func:`tabulated_friction`, :class:`Asymmetric`, or one of yours (:func:`friction_law`).
+        mu_k: kinetic friction coefficient of "coulomb", least one of "exponential" and "gaussian", in [0, mu_s] where
+            used.
         delta: of "hyperbolic", in [0, 1000].
-        v_0: of "exponential", in [0.001, 100].
-        mu_v: viscous part of "exponential", in [0, 10].
-        kappa: of "duffing", in [0, 10].
+        v_0: of "exponential" and "gaussian", in [0.001, 100].
+        mu_v: viscous part of "hyperbolic", "exponential" and "gaussian", in [0, 10].
+        linear_stiffness: of "duffing", in [-10, 10]; below 0 with kappa > 0 it has two wells, at constant N.
+        kappa: of "duffing", in [-10, 10]; below 0 the spring softens.
         force_amplitude: of the exciting force, in [0, 100].
         ripple_amplitude: of the ripple on the belt's speed, in [0, 10].
         stiffness_amplitude: of the spring's modulation, in [0, 1].
@@ -159,44 +145,47 @@ class OscillatorParameters:
         ValueError: if a value lies outside its range.
     """
 
-    geometry: Geometry = "exact"
-    alpha: float = 0.8
-    g1: float = 1.0
-    beta: float = 0.05
-    mu_s: float = 0.2
-    mu_m: float = 0.05
-    v_m: float = 0.5
-    belt_speed: float = 0.2
-    time_scale: float = 1.0
-    length_scale: float = 1.0
-    force_scale: float = 1.0
-    friction: Friction = "stribeck"
-    mu_k: float = 0.1
-    delta: float = 3.0
-    v_0: float = 0.5
-    mu_v: float = 0.0
-    kappa: float = 1.0
-    force_amplitude: float = 0.0
-    force_frequency: float = 1.0
-    force_phase: float = 0.0
-    ripple_amplitude: float = 0.0
-    ripple_frequency: float = 1.0
-    ripple_phase: float = 0.0
-    stiffness_amplitude: float = 0.0
-    stiffness_frequency: float = 1.0
-    stiffness_phase: float = 0.0
+    geometry: Any = "exact"
+    alpha: float = _number(0.8, 0.0, 10.0, "height of the spring's anchor, H/L", law="exact, cubic")
+    g1: float = _number(1.0, 1e-3, 100.0, "weight, g/(L omega0^2)")
+    beta: float = _number(0.05, 0.0, 10.0, "damping ratio, C/(2 M omega0)")
+    mu_s: float = _number(0.2, 0.0, 10.0, "static friction coefficient")
+    mu_m: float = _number(0.05, 0.0, 10.0, "least kinetic friction coefficient", law="stribeck")
+    v_m: float = _number(0.5, 1e-2, 100.0, "relative speed at which friction is least", law="stribeck")
+    belt_speed: float = _number(0.2, 0.0, 10.0, "belt speed v_b")
+    time_scale: float = _number(1.0, 1e-12, 1e12, "1/omega0", "s")
+    length_scale: float = _number(1.0, 1e-12, 1e12, "L", "m")
+    force_scale: float = _number(1.0, 1e-12, 1e18, "K L", "N")
+    friction: Any = "stribeck"
+    mu_k: float = _number(0.1, 0.0, 10.0, "kinetic friction coefficient", law="coulomb, exponential, gaussian")
+    delta: float = _number(3.0, 0.0, 1e3, "inverse of the speed at which friction halves", law="hyperbolic")
+    v_0: float = _number(0.5, 1e-3, 100.0, "speed over which friction falls", law="exponential, gaussian")
+    mu_v: float = _number(0.0, 0.0, 10.0, "viscous friction", law="hyperbolic, exponential, gaussian")
+    linear_stiffness: float = _number(
+        1.0, -10.0, 10.0, "linear stiffness; below 0 with kappa > 0 two wells", law="duffing"
+    )
+    kappa: float = _number(1.0, -10.0, 10.0, "cubic stiffness", law="duffing")
+    force_amplitude: float = _number(0.0, 0.0, 100.0, "amplitude of the exciting force", law="force")
+    force_frequency: float = _number(1.0, 1e-2, 1e3, "its angular frequency", law="force")
+    force_phase: float = _number(0.0, -10.0, 10.0, "its phase at t = 0", "rad", law="force")
+    ripple_amplitude: float = _number(0.0, 0.0, 10.0, "amplitude of the belt speed's ripple", law="ripple")
+    ripple_frequency: float = _number(1.0, 1e-2, 1e3, "its angular frequency", law="ripple")
+    ripple_phase: float = _number(0.0, -10.0, 10.0, "its phase at t = 0", "rad", law="ripple")
+    stiffness_amplitude: float = _number(0.0, 0.0, 1.0, "modulation of the spring's force", law="stiffness")
+    stiffness_frequency: float = _number(1.0, 1e-2, 1e3, "its angular frequency", law="stiffness")
+    stiffness_phase: float = _number(0.0, -10.0, 10.0, "its phase at t = 0", "rad", law="stiffness")
 
     def __post_init__(self) -> None:
-        checked_choice("geometry", self.geometry, GEOMETRIES)
-        checked_choice("friction", self.friction, FRICTIONS)
+        object.__setattr__(self, "geometry", _floats(checked_spring_law("geometry", self.geometry, GEOMETRIES)))
+        object.__setattr__(self, "friction", _floats(checked_friction_law("friction", self.friction, FRICTIONS)))
         for name, (low, high) in RANGES.items():
             object.__setattr__(self, name, checked_number(name, getattr(self, name), low, high))
-        if self.mu_m > self.mu_s and self.friction == "stribeck":
+        if self.friction == "stribeck" and self.mu_m > self.mu_s:
             raise ValueError(f"mu_m must not exceed mu_s = {self.mu_s!r}, got {self.mu_m!r}")
-        if self.mu_k > self.mu_s and self.friction in ("coulomb", "exponential"):
+        if self.friction in ("coulomb", "exponential", "gaussian") and self.mu_k > self.mu_s:
             raise ValueError(f"mu_k must not exceed mu_s = {self.mu_s!r}, got {self.mu_k!r}")
-        smallest = {"exact": 0.0, "cubic": SMALLEST_ALPHA}.get(self.geometry, self.alpha)
-        if self.alpha < SMALLEST_ALPHA and self.alpha != smallest:
+        least = {"exact": 0.0, "cubic": SMALLEST_ALPHA} if isinstance(self.geometry, str) else {}
+        if self.alpha < SMALLEST_ALPHA and self.alpha != least.get(self.geometry, self.alpha):
             zero = "" if self.geometry == "cubic" else "0 or "
             raise ValueError(f"alpha must be {zero}a finite number in [{SMALLEST_ALPHA:g}, 10], got {self.alpha!r}")
 
@@ -206,55 +195,93 @@ class OscillatorParameters:
         M: float,
         K: float,
         C: float,
-        L: float,
-        H: float,
-        g: float,
-        V0: float,
-        mu_s: float,
-        mu_m: float,
-        V_m: float,
+        L: float | None = None,
+        H: float = 0.0,
+        g: float = 9.80665,
+        V0: float = 0.0,
+        mu_s: float = 0.2,
+        mu_m: float | None = None,
+        V_m: float | None = None,
         *,
-        geometry: Geometry = "exact",
+        geometry: Any = "exact",
+        friction: Any = "stribeck",
+        **numbers: Any,
     ) -> Self:
         """Return the dimensionless parameters of a rig given in SI units (the paper's list above Eq. 4).
 
         Args:
-            M: mass, kg. K: spring stiffness, N/m. C: damping coefficient, N s/m. L: free length of the spring, m.
-            H: height of its anchor over the belt, m. g: acceleration of gravity, m/s^2. V0: belt speed, m/s.
+            M: mass, kg. K: spring stiffness, N/m. C: damping coefficient, N s/m.
+            L: free length of the spring, m; the unit of length. Of a level spring None: M g/K, so that g1 is 1.
+            H: height of the spring's anchor over the belt, m; "exact" and "cubic" alone have one.
+            g: acceleration of gravity (or the load that presses the mass on the belt, over M), m/s^2.
+            V0: belt speed, m/s.
             mu_s, mu_m: friction coefficients. V_m: relative speed at which friction is least, m/s.
-            geometry: as in the class.
+            geometry, friction: as in the class; the numbers of laws of your own are in SI units.
+            numbers: what else the laws need. ``mu_k``; ``V_0``, m/s; ``delta`` and ``mu_v``, s/m; ``K3``, the cubic
+                stiffness of "duffing", N/m^3; ``linear_stiffness``, over K; ``force_amplitude``, N;
+                ``ripple_amplitude``, m/s; ``stiffness_amplitude``; each with ``_frequency``, rad/s, and ``_phase``.
 
         The results' ``time_scale``, ``length_scale`` and ``force_scale`` lead back: t = time_scale tau,
         X = length_scale x, dX/dt = length_scale / time_scale x', F = force_scale u.
 
         Raises:
-            TypeError, ValueError: as the class does; M, K, L, g and V_m must be positive.
+            TypeError, ValueError: as the class does; M, K, L, g, V_m and V_0 must be positive.
         """
-        for name, value in {"M": M, "K": K, "L": L, "g": g, "V_m": V_m}.items():
+        if L is None:
+            if isinstance(geometry, str) and geometry in ("exact", "cubic"):
+                raise TypeError(f"L, the spring's free length in metres, must be given with geometry {geometry!r}")
+            checked_number("M", M, math.ulp(0.0), 1e12)
+            L = M * checked_number("g", g, math.ulp(0.0), 1e12) / checked_number("K", K, math.ulp(0.0), 1e12)
+        given = {"mu_m": mu_m, "V_m": V_m, **numbers}
+        given = {name: value for name, value in given.items() if value is not None}
+        unknown = sorted(set(given) - set(_SI_NUMBERS))
+        if unknown:
+            raise TypeError(f"a rig has no number {unknown[0]!r}; allowed: {', '.join(_SI_NUMBERS)}")
+        positive = {"M": M, "K": K, "L": L, "g": g}
+        positive |= {name: given[name] for name in ("V_m", "V_0") if name in given}
+        for name, value in positive.items():
             checked_number(name, value, math.ulp(0.0), 1e12)
         for name, value in {"C": C, "H": H, "V0": V0}.items():
             checked_number(name, value, 0.0, 1e12)
         omega0 = math.sqrt(K / M)
+        speed = L * omega0
+        units = {"": 1.0, "speed": speed, "1/speed": 1.0 / speed, "force": K * L, "frequency": omega0}
+        units["force/length^3"] = K / (L * L)
+        fields = {}
+        for name, value in given.items():
+            field, unit = _SI_NUMBERS[name]
+            fields[field] = checked_number(name, value, -1e18, 1e18) / units[unit]
+        if not isinstance(friction, str):
+            friction = ScaledFriction(checked_friction_law("friction", friction, FRICTIONS), speed)
+        if not isinstance(geometry, str):
+            geometry = ScaledSpring(checked_spring_law("geometry", geometry, GEOMETRIES), L, K * L)
         return cls(
             geometry=geometry,
-            alpha=H / L,
+            friction=friction,
+            **({"alpha": H / L} if H or geometry in ("exact", "cubic") else {}),
             g1=g / (L * omega0 * omega0),
             beta=C / (2.0 * M * omega0),
             mu_s=mu_s,
-            mu_m=mu_m,
-            v_m=V_m / (L * omega0),
-            belt_speed=V0 / (L * omega0),
+            belt_speed=V0 / speed,
             time_scale=1.0 / omega0,
             length_scale=L,
             force_scale=K * L,
+            **fields,
         )
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some values changed, checked anew."""
-        unknown = set(changes) - {field.name for field in dataclasses.fields(self)}
+        """Return a copy with some values changed, checked anew.
+
+        Numbers of a law of one's own are named ``friction.name`` and ``geometry.name``:
+        ``p.replace(**{"friction.mu_s": 0.3})``.
+        """
+        unknown = set(changes) - {field.name for field in dataclasses.fields(self)} - set(self.law_numbers)
         if unknown:
-            names = ", ".join(field.name for field in dataclasses.fields(self))
+            names = ", ".join([*(field.name for field in dataclasses.fields(self)), *self.law_numbers])
             raise ValueError(f"unknown parameter {sorted(unknown)[0]!r}; allowed: {names}")
+        dotted = {name: changes.pop(name) for name in list(changes) if "." in name}
+        for part in {name.split(".")[0] for name in dotted}:
+            changes[part] = _with_numbers(getattr(self, part), f"{part}.", dotted)
         return dataclasses.replace(self, **changes)
 
     @property
@@ -285,39 +312,143 @@ class OscillatorParameters:
         return self.belt_speed + self.ripple_amplitude * math.cos(self.ripple_phase)
 
     @property
-    def geometry_code(self) -> int:
-        """The kernel's number of the spring's law."""
-        if self.geometry == "exact" and self.alpha == 0.0:
-            return kernel.DISCONTINUOUS
-        return GEOMETRY_CODES[self.geometry]
+    def discontinuous(self) -> bool:
+        """Whether x = 0 switches the spring's force: alpha = 0."""
+        return bool(self.geometry == "exact" and self.alpha == 0.0)
 
     @property
-    def beyond(self) -> bool:
-        """Whether anything is asked for beyond the paper's laws: then the kernel's general form runs, slower."""
-        return (
-            self.friction != "stribeck" or self.excited or self.geometry_code in (kernel.DUFFING, kernel.DISCONTINUOUS)
-        )
+    def law_numbers(self) -> dict[str, float]:
+        """The numbers of laws of one's own, as ``friction.name`` and ``geometry.name``."""
+        numbers: dict[str, float] = {}
+        for part in ("geometry", "friction"):
+            law = getattr(self, part)
+            if not isinstance(law, str):
+                names = (f"{part}.{name}" for name in kernel.leaf_names(law))
+                numbers.update(zip(names, kernel.leaves_of(law), strict=True))
+        return numbers
 
     @property
-    def plant(self) -> kernel.Plant:
+    def values(self) -> dict[str, float]:
+        """All numbers by name, those of laws of one's own too."""
+        return {name: getattr(self, name) for name in RANGES} | self.law_numbers
+
+    @property
+    def kind(self) -> "Kind":
+        """The laws without their numbers."""
+        geometry = "discontinuous" if self.discontinuous else _blank(self.geometry)
+        return Kind(geometry, _blank(self.friction), self.excited)
+
+    @property
+    def plant(self) -> Plant:
         """The values that compiled code takes."""
-        laws = self.laws(0.0) if self.beyond else None
-        return kernel.Plant(self.geometry_code, self.alpha, self.g1, self.beta, self.mu_s, self.k1, self.k3, laws)
+        return plant_of(self.kind, self.values)
 
-    def laws(self, time: float) -> kernel.Laws:
-        """Return the values that compiled code takes of what is beyond the paper's laws, at a time."""
-        numbers = [getattr(self, name) for name in law_numbers(self.friction)]
-        return kernel.Laws._make((0.0, FRICTION_CODES[self.friction], *numbers, time))
+    def excited_plant(self, time: float) -> Plant:
+        """The values that compiled code takes at a time; those of an excitation even if there is none."""
+        plant = plant_of(self.kind._replace(excited=True), self.values)
+        return plant._replace(excitation=plant.excitation._replace(time=time))
 
     def restoring_force(self, x: float) -> float:
         """Return R(x), at time 0."""
-        return float(kernel.spring(self.plant, float(x))[0])
+        return float(kernel.restoring_force(self.plant, float(x)))
 
     def normal_force(self, x: float) -> float:
         """Return N(x), at time 0."""
-        return float(kernel.spring(self.plant, float(x))[1])
+        return float(kernel.normal_force(self.plant, float(x)))
 
     def friction_coefficient(self, v_rel: float) -> float:
         """Return mu(v_rel); at v_rel = 0, where it is set-valued, 0."""
-        mode = (v_rel > 0) - (v_rel < 0)
-        return float(kernel.friction_coefficient(self.plant, mode, float(v_rel)))
+        if v_rel == 0:
+            return 0.0
+        return float(kernel.friction_coefficient(self.plant, 1 if v_rel > 0 else -1, float(v_rel)))
+
+
+FIELDS: dict[str, Mapping[str, Any]] = {
+    field.name: field.metadata for field in dataclasses.fields(OscillatorParameters) if field.metadata
+}
+RANGES: dict[str, tuple[float, float]] = {name: field["range"] for name, field in FIELDS.items()}  # both ends included
+
+
+_SI_NUMBERS = {  # of a rig, by their names in SI units: the field, and what it is divided by
+    **{name: (name, "") for name in ("mu_m", "mu_k", "linear_stiffness", "stiffness_amplitude")},
+    **{f"{means}_phase": (f"{means}_phase", "") for means in EXCITATIONS},
+    **{f"{means}_frequency": (f"{means}_frequency", "frequency") for means in EXCITATIONS},
+    "V_m": ("v_m", "speed"),
+    "V_0": ("v_0", "speed"),
+    "delta": ("delta", "1/speed"),
+    "mu_v": ("mu_v", "1/speed"),
+    "K3": ("kappa", "force/length^3"),
+    "force_amplitude": ("force_amplitude", "force"),
+    "ripple_amplitude": ("ripple_amplitude", "speed"),
+}
+
+
+class Kind(NamedTuple):
+    """The laws of a plant without their numbers."""
+
+    geometry: Any  # a name, or a spring of one's own with zeros; "discontinuous" for alpha = 0
+    friction: Any  # a name, or a law of one's own with zeros
+    excited: bool
+
+
+def _floats(law: Any) -> Any:
+    """Return a law with floats for whole numbers, for which numba would compile it once more."""
+    if isinstance(law, str):
+        return law
+    values = (_floats(value) if isinstance(value, tuple) else value for value in law)
+    return law._make(float(value) if isinstance(value, int) else value for value in values)
+
+
+def _blank(law: Any) -> Any:
+    return law if isinstance(law, str) else _with_numbers(law, "", dict.fromkeys(kernel.leaf_names(law), 0.0))
+
+
+def _with_numbers(law: Any, prefix: str, values: Mapping[str, Any]) -> Any:
+    """Return a law with the numbers that ``values`` has under its fields' names, after a prefix."""
+    fields = {}
+    for name, value in zip(law._fields, law, strict=True):
+        nested = isinstance(value, tuple)
+        path = prefix + name
+        fields[name] = _with_numbers(value, f"{path}.", values) if nested else values.get(path, value)
+    return type(law)(**fields)
+
+
+def plant_of(kind: Kind, values: Mapping[str, Any]) -> Plant:
+    """Return the plant with these laws and numbers, floats or arrays (n,)."""
+
+    def numbers(*names: str) -> list[Any]:
+        return [values[name] for name in names]
+
+    spring: Any
+    match kind.geometry:
+        case "exact":
+            spring = Inclined(values["alpha"])
+        case "discontinuous":
+            spring = Discontinuous(0.0)
+        case "cubic":
+            spring = Cubic(values["alpha"])
+        case "linear":
+            spring = Linear(1.0)
+        case "duffing":
+            spring = Duffing(values["linear_stiffness"], values["kappa"])
+        case law:
+            spring = _with_numbers(law, "geometry.", values)
+    friction: Any
+    match kind.friction:
+        case "stribeck":
+            friction = Stribeck(values["mu_s"], *stribeck_coefficients(*numbers("mu_s", "mu_m", "v_m")))
+        case "coulomb":
+            friction = Coulomb(*numbers("mu_s", "mu_k"))
+        case "hyperbolic":
+            friction = Hyperbolic(*numbers("mu_s", "delta", "mu_v"))
+        case "exponential":
+            friction = Exponential(*numbers("mu_s", "mu_k", "v_0", "mu_v"))
+        case "gaussian":
+            friction = Gaussian(*numbers("mu_s", "mu_k", "v_0", "mu_v"))
+        case law:
+            friction = _with_numbers(law, "friction.", values)
+    excitation: Any = Unexcited(0.0)
+    if kind.excited:
+        names = [f"{means}_{what}" for means in EXCITATIONS for what in ("amplitude", "frequency", "phase")]
+        excitation = Excitation._make((*numbers(*names), 0.0))
+    return Plant(spring, friction, excitation, values["g1"], values["beta"])

@@ -157,7 +157,19 @@ def simulate(
     grid = dt * np.arange(math.floor(t_end / dt * (1.0 + 1e-12)) + 1)
     grid = np.append(grid[grid < t_end * (1.0 - 1e-12)], t_end) if t_end > 0.0 else np.zeros(1)
     start_energy = 0.5 * v * v + kernel.energy_in_spring(plant, x)
-    parts = [np.array([[0.0, x, v, belt, kernel.mode_of(plant, x, v, belt, accelerations[0], forces[0])]])]
+    parts = [
+        np.array(
+            [
+                [
+                    0.0,
+                    x,
+                    v,
+                    belt,
+                    kernel.mode_of(plant, kernel.State(x, v), kernel.Drive(belt, accelerations[0], forces[0])),
+                ]
+            ]
+        )
+    ]
     events: list[Event] = []
     damping = contact = control = excitation = stick_time = 0.0
     status = kernel.OK
@@ -181,12 +193,14 @@ def simulate(
             piece = times[done : done + _CHUNK] - (t0 - begin)
             samples = np.empty((piece.size, 4))
             buffer = np.empty((max(4 * kernel.MAX_EVENTS, piece.size), 4))
-            now = kernel.later(plant, t0)
+            now = kernel.at_time(plant, t0)
             taken, n_events, status, reached, int_v2, stuck, int_fv = kernel.trace(
-                now, mode, x, v, belt0, a_belt, u, piece, samples, buffer
+                now, mode, kernel.State(x, v), kernel.Drive(belt0, a_belt, u), piece, samples, buffer
             )
             if parameters.excited:
-                excitation += kernel.excitation_work(now, x, v, belt0, a_belt, u, reached, buffer[:n_events])
+                excitation += kernel.excitation_work(
+                    now, kernel.State(x, v), kernel.Drive(belt0, a_belt, u), reached, buffer[:n_events]
+                )
             events += [Event(t0 + e[0], kernel.EVENT_NAMES[int(e[1])], e[2], e[3]) for e in buffer[:n_events].tolist()]
             damping -= 2.0 * parameters.beta * int_v2
             contact += int_fv
@@ -218,7 +232,7 @@ def simulate(
         events=tuple(events),
         stick_time=stick_time,
         energy=EnergyBalance(
-            change=0.5 * v * v + kernel.energy_in_spring(kernel.later(plant, float(table[-1, 0])), x) - start_energy,
+            change=0.5 * v * v + kernel.energy_in_spring(kernel.at_time(plant, float(table[-1, 0])), x) - start_energy,
             damping=damping,
             contact=contact,
             control=control,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Self, TypeAlias, get_args
@@ -32,10 +33,12 @@ IntegerArray: TypeAlias = NDArray[np.int64]
 RANDOMISABLE = (  # each has its own random numbers, by its place here
     *("alpha", "g1", "beta", "mu_s", "mu_m", "v_m", "belt_speed", "mu_k", "delta", "v_0", "mu_v", "kappa"),
     *(f"{kind}_{what}" for kind in EXCITATIONS for what in ("amplitude", "frequency", "phase")),
+    "linear_stiffness",
 )
 
 # Slots of the counter-based generator at step 0 of an episode; sensor noise uses the steps from 1 on.
 PHASE_SLOT, _X_SLOT, _V_SLOT, _PARAMETER_SLOT = 0, 1, 2, 8  # of the random numbers with which an episode begins
+_LAW_SLOT = 1024  # the first of those of laws of one's own
 
 _RANGES: dict[str, tuple[float, float]] = {
     "force_limit": (0.0, 100.0),
@@ -71,7 +74,8 @@ class Task:
             "rest" (at the unloaded spring's place of rest, v = 0) or "random" (x within 3 x_scale of x_offset, v
             within 4 v_scale of 0).
         kick: velocity given to a mass that starts at its equilibrium.
-        randomise: parameters drawn evenly from (low, high) at each reset, by name.
+        randomise: parameters drawn evenly from (low, high) at each reset, by name; numbers of a law of your own as
+            ``friction.NAME`` or ``geometry.NAME``.
         show_parameters: whether the observation ends with the randomised parameters, each scaled to [-1, 1].
         show_phases: whether the observation holds the cosine and sine of the phase of each excitation (force, ripple,
             stiffness); without it they are hidden.
@@ -184,7 +188,7 @@ class Task:
         """
         values = {}
         for name, (low, high) in self.randomise.items():
-            shares = kernel.random_uniforms(keys, episodes, 0, _PARAMETER_SLOT + RANDOMISABLE.index(name))
+            shares = kernel.random_uniforms(keys, episodes, 0, _slot_of(name))
             values[name] = low + (high - low) * shares
         return values
 
@@ -245,6 +249,13 @@ class Task:
         return cycle.state(phase)
 
 
+def _slot_of(name: str) -> int:
+    """Return the slot of the random numbers that draw a parameter."""
+    if name in RANDOMISABLE:
+        return _PARAMETER_SLOT + RANDOMISABLE.index(name)
+    return _LAW_SLOT + zlib.crc32(name.encode())
+
+
 def steps_before_last_quarter(episode_steps: int) -> int:
     """Return how many of an episode's steps come before its last quarter."""
     return episode_steps - max(1, episode_steps // 4)
@@ -255,14 +266,17 @@ def _checked_randomisation(randomise: Any) -> dict[str, tuple[float, float]]:
         raise TypeError(f"randomise must map parameter names to (low, high), got {randomise!r}")
     checked = {}
     for name, interval in randomise.items():
-        if name not in RANDOMISABLE:
-            raise ValueError(f"randomise has no parameter {name!r}; allowed: {', '.join(RANDOMISABLE)}")
+        of_own_law = isinstance(name, str) and name.startswith(("friction.", "geometry."))
+        if name not in RANDOMISABLE and not of_own_law:
+            allowed = f"{', '.join(RANDOMISABLE)}, and friction.NAME or geometry.NAME of a law of your own"
+            raise ValueError(f"randomise has no parameter {name!r}; allowed: {allowed}")
         try:
             low, high = interval
         except (TypeError, ValueError):
             raise ValueError(f"randomise[{name!r}] must be a pair (low, high), got {interval!r}") from None
-        low = checked_number(f"randomise[{name!r}] low", low, *RANGES[name])
-        high = checked_number(f"randomise[{name!r}] high", high, *RANGES[name])
+        range_of = RANGES.get(name, (-1e12, 1e12))
+        low = checked_number(f"randomise[{name!r}] low", low, *range_of)
+        high = checked_number(f"randomise[{name!r}] high", high, *range_of)
         if low > high:
             raise ValueError(f"randomise[{name!r}] must have low <= high, got {interval!r}")
         if name == "alpha" and low < SMALLEST_ALPHA and high > 0.0:

@@ -29,6 +29,7 @@ from sd_friction_env.env import (
     checked_options,
     checked_state,
     named_statistics,
+    place_of,
     read_state,
     real_array,
     start_of,
@@ -39,18 +40,17 @@ from sd_friction_env.env import (
 from sd_friction_env.orbits import rest_place
 from sd_friction_env.parameters import (
     EXCITATIONS,
-    FRICTION_CODES,
     FRICTIONS,
     GEOMETRIES,
     RANGES,
+    Kind,
     OscillatorParameters,
     brief_repr,
     checked_choice,
     checked_count,
-    law_numbers,
+    plant_of,
 )
 from sd_friction_env.task import EPISODE_STEPS, PHASE_SLOT, FloatArray, IntegerArray, passive_motion
-from sd_friction_env.theory import stribeck_coefficients
 
 _MOST_ENVS = 2**24
 _MOST_THREADS = 256
@@ -59,52 +59,32 @@ _MOST_RENDERED = 16
 
 REWARD_TERMS = ("reward_vibration", "reward_effort", "reward_stick", "reward_contact_loss")
 _REPORT = {
-    "x": kernel.O_X,
-    "v": kernel.O_V,
-    "v_belt": kernel.O_BELT,
-    "v_rel": kernel.O_V_REL,
-    "normal_force": kernel.O_NORMAL,
-    "time": kernel.O_TIME,
-    "action": kernel.O_ACTION,
-    "force": kernel.O_FORCE,
-    "belt_acceleration": kernel.O_A_BELT,
-    "x_min": kernel.O_X_MIN,
-    "x_max": kernel.O_X_MAX,
-    "mean_square_velocity": kernel.O_MEAN_V2,
-    "stick_fraction": kernel.O_STICK_FRACTION,
-    "friction_power": kernel.O_FRICTION_POWER,
-    "control_power": kernel.O_CONTROL_POWER,
-    "reward_vibration": kernel.O_VIBRATION,
-    "reward_effort": kernel.O_EFFORT,
-    "reward_stick": kernel.O_STICK,
-    "reward_contact_loss": kernel.O_CONTACT_LOSS,
+    "x": kernel.LANE_X_END,
+    "v": kernel.LANE_V_END,
+    "v_belt": kernel.LANE_BELT_END,
+    "v_rel": kernel.LANE_V_REL,
+    "normal_force": kernel.LANE_NORMAL,
+    "time": kernel.LANE_TIME,
+    "action": kernel.LANE_ACTION,
+    "force": kernel.LANE_U,
+    "belt_acceleration": kernel.LANE_A_BELT,
+    "x_min": kernel.LANE_X_MIN,
+    "x_max": kernel.LANE_X_MAX,
+    "mean_square_velocity": kernel.LANE_MEAN_V2,
+    "stick_fraction": kernel.LANE_STICK_FRACTION,
+    "friction_power": kernel.LANE_FRICTION_POWER,
+    "control_power": kernel.LANE_CONTROL_POWER,
+    "reward_vibration": kernel.LANE_VIBRATION,
+    "reward_effort": kernel.LANE_EFFORT,
+    "reward_stick": kernel.LANE_STICK,
+    "reward_contact_loss": kernel.LANE_CONTACT_LOSS,
 }
-_CODES = {"mode": kernel.C_MODE, "events": kernel.C_EVENTS}
+_CODES = {"mode": 0, "events": 1}
 _STEP_KEYS = (*_REPORT, *_CODES, "status")
 RESET_KEYS = ("x", "v", "v_belt", "v_rel", "mode", "normal_force", "time")
 INFO_KEYS = (*_STEP_KEYS, "parameters")
-_NUMBERS = tuple(RANGES)  # the numeric fields of OscillatorParameters
-_STATE_ROWS = {
-    "alpha": kernel.S_ALPHA,
-    "g1": kernel.S_G1,
-    "beta": kernel.S_BETA,
-    "mu_s": kernel.S_MU_S,
-    "belt_speed": kernel.S_BELT_SPEED,
-    **{name: kernel.S_MU_K + i for i, name in enumerate(law_numbers("exponential"))},
-}
-_GEOMETRIES = (*GEOMETRIES, "exact")  # by the kernel's numbers: the last has alpha = 0
-_AMPLITUDES = [_STATE_ROWS[f"{kind}_amplitude"] for kind in EXCITATIONS]
+_AMPLITUDES = tuple(f"{means}_amplitude" for means in EXCITATIONS)
 _STATE_METHODS = ("reset", "set_state", "step")  # of the single environment
-
-
-def _kinds_of(parameters: OscillatorParameters) -> IntegerArray:
-    """Return the kernel's numbers of the geometry and of the friction law, (2, 1)."""
-    return np.array([[parameters.geometry_code], [FRICTION_CODES[parameters.friction]]])
-
-
-def _kinds(state: FloatArray, integers: IntegerArray, i: int) -> IntegerArray:
-    """Return the same of a column of the kernel's arrays, (2,)."""
-    return np.array([integers[kernel.I_GEOMETRY, i], int(state[kernel.S_FRICTION, i])])
 
 
 class _Buffers(NamedTuple):
@@ -120,11 +100,21 @@ class _Starts(NamedTuple):
     """Episodes of environments that are ready to begin; nothing of the batch has been changed yet."""
 
     which: IntegerArray
-    numbers: FloatArray  # rows: _NUMBERS, columns as in which
+    numbers: FloatArray  # rows: the batch's names, columns as in which
+    laws: IntegerArray  # (k,), places in the batch's list of laws
+    kinds: list[tuple[Kind, IntegerArray]]  # each kind of plant, and its columns
     state: FloatArray  # columns of the kernel's arrays
-    integers: IntegerArray
+    counts: IntegerArray
     own: NDArray[np.bool_]  # who has other parameters than the nominal ones
-    beyond: bool  # whether any has laws beyond the paper's
+
+
+class _Group(NamedTuple):
+    """Environments whose plants are of one kind."""
+
+    kind: Kind
+    which: IntegerArray
+    steppers: kernel.Steppers
+    tables: FloatArray
 
 
 class FinalObservations(np.ndarray[Any, np.dtype[Any]]):
@@ -266,20 +256,20 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         self.action_space = batch_space(self.single_action_space, n)
 
         task = self.task
-        self._nominal_kinds = _kinds_of(self.nominal)
-        self._beyond: kernel.Laws | None = None  # not None where any environment has laws beyond the paper's
-        self._nominal_numbers = np.array([[getattr(self.nominal, name)] for name in _NUMBERS])
+        self._names = tuple(self.nominal.values)
+        self._laws: list[tuple[Any, Any]] = [(self.nominal.geometry, self.nominal.friction)]
+        self._law = np.zeros(n, np.int64)  # each environment's place in this list
+        self._kinds: list[tuple[Kind, IntegerArray]] = [(self._kind_of(self.nominal), np.arange(n))]
+        self._nominal_numbers = np.array(list(self.nominal.values.values()))[:, None]
         self._task_numbers, self._task_codes = task_arrays(task)
         # Rows of an odd number of cache lines: lengths of a power of two would crowd into few places of the cache.
         self._width = n if n < kernel.LANES else 8 * (2 * (n // 16) + 3)
-        self._state = np.zeros((kernel.STATE_ROWS, self._width))
-        self._integers = np.zeros((kernel.INTEGER_ROWS, self._width), np.int64)
-        self._numbers = np.zeros((len(_NUMBERS), n))
+        self._state = np.zeros((kernel.STATE_PLANT, self._width))
+        self._counts = np.zeros((kernel.COUNT_ROWS, self._width), np.int64)
+        self._numbers = np.zeros((len(self._names), n))
         self._past = np.zeros((task.sensor_delay + 1 if task.sensor_delay else 0, 2, n))
         self._shown = np.zeros((n, len(task.randomise) if task.show_parameters else 0))
         shares = max(1, min(self.threads, n // _ENVS_WORTH_A_THREAD))
-        self._works = np.ones((shares, kernel.WORK_SIZE))
-        self._task_codes[kernel.T_TRAVEL] = True
         self._own = np.zeros(n, np.bool_)  # who has other parameters than the nominal ones
         # Whether compiled code alone can begin the next episode of one with the nominal parameters.
         self._restarts_alike = task.start != "random" and not task.randomise
@@ -315,21 +305,33 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
 
     def _make_what_does_not_travel(self) -> None:
         """Make what a copy has to make anew: compiled code, and arrays that cannot be written to."""
-        self._choose_stepper()
+        self._form_groups()
         self._kept: _Buffers | None = None
         self._all = np.ones(self.num_envs, np.bool_)  # what holds for all is one array for all steps
         self._all.setflags(write=False)
         self._masks = {f"_{name}": self._all for name in self.step_keys}
 
-    def _choose_stepper(self) -> None:
-        if self._beyond or self.nominal.beyond:
-            self._stepper, self._stepper_in_threads = kernel.step_beyond, kernel.step_beyond_in_threads
-        else:
-            self._stepper = kernel.STEPPERS[self.nominal.geometry_code]
-            self._stepper_in_threads = kernel.STEPPERS_IN_THREADS[self.nominal.geometry_code]
+    def _form_groups(self) -> None:
+        """Find what steps the plants of each kind."""
+        self._groups = [self._group(*kind) for kind in self._kinds]
+        rows = kernel.STATE_PLANT + max(group.steppers.leaves for group in self._groups)
+        if len(self._state) < rows:
+            self._state = np.concatenate((self._state, np.zeros((rows - len(self._state), self._width))))
+        size = self._groups[0].steppers.work_size
+        self._works = np.ones((len(self._ended), size))
+        self._task_codes[kernel.TASK_ONE_PLANT] = False
+
+    def _group(self, kind: Kind, which: IntegerArray) -> _Group:
+        plant = plant_of(kind, self.nominal.values)
+        return _Group(kind, which, kernel.steppers(plant), kernel.tables_of(plant))
+
+    def _kind_of(self, parameters: OscillatorParameters) -> Kind:
+        # Phases that are shown are those of an excitation, even of one that is too small to be seen.
+        kind = parameters.kind
+        return kind._replace(excited=kind.excited or self.task.show_phases)
 
     def __getstate__(self) -> dict[str, Any]:
-        anew = ("_stepper", "_stepper_in_threads", "_kept", "_all", "_masks")
+        anew = ("_groups", "_works", "_kept", "_all", "_masks")
         return {name: value for name, value in vars(self).items() if name not in anew}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -361,7 +363,7 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         which = self._everyone if mask is None else np.flatnonzero(mask)
         if not self._is_reset and len(which) < n:
             raise gym.error.ResetNeeded("reset all environments once before resetting some: the others have no state")
-        keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which] + 1
+        keys, episodes = self._counts[kernel.COUNT_KEY, which], self._counts[kernel.COUNT_EPISODE, which] + 1
         new_seeds = list(self._seeds)
         stream = None if self._is_reset else copying.deepcopy(self.np_random)
         for place, i in enumerate(which.tolist()):
@@ -370,9 +372,10 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
                 keys[place], episodes[place] = seeding.np_random(seeds[i])[0].integers(2**62), 0
             elif stream is not None:
                 keys[place], episodes[place] = stream.integers(2**62), 0
-        parameters, kinds = self._drawn(keys, episodes)
-        given = self._given(which, keys, episodes, per_env, parameters, kinds)
-        starts = self._prepared(which, keys, episodes, parameters, kinds, *given)
+        numbers = self._drawn(keys, episodes)
+        laws = np.zeros(len(which), np.int64)
+        given = self._given(which, keys, episodes, per_env, numbers, laws)
+        starts = self._prepared(which, keys, episodes, numbers, laws, *given)
         # Nothing can go wrong from here on, and only now is anything changed.
         if stream is not None:
             self.np_random.bit_generator.state = stream.bit_generator.state
@@ -384,13 +387,12 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         info = self._reset_info(which, self._at_start(which))
         return self._observations.copy() if self.copy else self._observations, info
 
-    def _drawn(self, keys: IntegerArray, episodes: IntegerArray) -> tuple[FloatArray, IntegerArray]:
-        """Return the parameters (rows: ``_NUMBERS``) and the kinds (2, k), geometry and friction, with which episodes
-        begin."""
-        parameters = np.repeat(self._nominal_numbers, len(keys), axis=1)
+    def _drawn(self, keys: IntegerArray, episodes: IntegerArray) -> FloatArray:
+        """Return the numbers (rows: the batch's names) with which episodes begin."""
+        numbers = np.repeat(self._nominal_numbers, len(keys), axis=1)
         for name, values in self.task.draws(keys, episodes).items():
-            parameters[_NUMBERS.index(name)] = values
-        return parameters, np.repeat(self._nominal_kinds, len(keys), axis=1)
+            numbers[self._names.index(name)] = values
+        return numbers
 
     def _given(
         self,
@@ -398,37 +400,73 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         keys: IntegerArray,
         episodes: IntegerArray,
         per_env: list[dict[str, Any]] | None,
-        parameters: FloatArray,
-        kinds: IntegerArray,
+        numbers: FloatArray,
+        laws: IntegerArray,
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Put what options say into parameters and kinds; return the starts that they ask for, and for whom."""
+        """Put what options say into numbers and laws; return the starts that they ask for, and for whom."""
         x, v, placed = np.zeros(len(which)), np.zeros(len(which)), np.zeros(len(which), np.bool_)
         for place, i in enumerate(which.tolist() if per_env is not None else []):
             assert per_env is not None
             options = per_env[i]
-            own = self._as_parameters(parameters[:, place], kinds[:, place])
+            own = self._as_parameters(numbers[:, place], 0)
             if "parameters" in options:
                 own = own.replace(**options["parameters"])
                 check_belt(own)
-                parameters[:, place] = [getattr(own, name) for name in _NUMBERS]
-                kinds[:, place] = _kinds_of(own)[:, 0]
+                numbers[:, place], laws[place] = self._columns_of(own)
             if any(name in options for name in ("x", "phase", "start")):
                 x[place], v[place] = start_of(self.task, own, options, int(keys[place]), int(episodes[place]))
                 placed[place] = True
         return x, v, placed
 
-    def _as_parameters(self, numbers: FloatArray, kinds: IntegerArray) -> OscillatorParameters:
-        values = dict(zip(_NUMBERS, numbers.tolist(), strict=True))
-        geometry, friction = kinds.tolist()
-        return self.nominal.replace(geometry=_GEOMETRIES[geometry], friction=FRICTIONS[friction], **values)
+    def _columns_of(self, parameters: OscillatorParameters) -> tuple[list[float], int]:
+        """Return parameters as the batch keeps them: numbers by its names, and the place of their laws in its list."""
+        values = self._nominal_numbers[:, 0].tolist()
+        kind, nominal = parameters.unexcited.kind, self.nominal.unexcited.kind
+        alike = kind.friction == nominal.friction and kind.geometry == nominal.geometry
+        laws = self._laws[0] if alike else (parameters.geometry, parameters.friction)
+        found = parameters.values
+        numbers = [
+            found[name] if name in RANGES or alike else value for name, value in zip(self._names, values, strict=True)
+        ]
+        if laws not in self._laws:
+            self._laws.append(laws)
+        return numbers, self._laws.index(laws)
+
+    def _as_parameters(self, numbers: FloatArray, law: int) -> OscillatorParameters:
+        values = dict(zip(self._names, numbers.tolist(), strict=True))
+        if law != 0:
+            geometry, friction = self._laws[law]
+            values = {name: value for name, value in values.items() if name in RANGES}
+            return self.nominal.replace(geometry=geometry, friction=friction, **values)
+        return self.nominal.replace(**values)
+
+    def _kinds_in(self, numbers: FloatArray, laws: IntegerArray) -> list[tuple[Kind, IntegerArray]]:
+        """Return the kinds of plants with these laws and numbers, each with its columns."""
+        excited = np.full(len(laws), self.task.show_phases)
+        for name in _AMPLITUDES:
+            excited |= numbers[self._names.index(name)] > 0.0
+        flat = numbers[self._names.index("alpha")] == 0.0
+        codes = 4 * laws + 2 * flat + excited
+        kinds: dict[Kind, IntegerArray] = {}
+        for code in np.unique(codes).tolist():
+            columns = np.flatnonzero(codes == code)
+            parameters = self._as_parameters(numbers[:, columns[0]], code // 4)
+            kind = self._kind_of(parameters)
+            if code >= 4:  # the numbers of a law of one's own are not among the batch's
+                kind = kind._replace(
+                    geometry=kind.geometry if isinstance(kind.geometry, str) else parameters.geometry,
+                    friction=kind.friction if isinstance(kind.friction, str) else parameters.friction,
+                )
+            kinds[kind] = np.union1d(kinds[kind], columns) if kind in kinds else columns
+        return list(kinds.items())
 
     def _prepared(
         self,
         which: IntegerArray,
         keys: IntegerArray,
         episodes: IntegerArray,
-        parameters: FloatArray,
-        kinds: IntegerArray,
+        numbers: FloatArray,
+        laws: IntegerArray,
         x: FloatArray,
         v: FloatArray,
         placed: NDArray[np.bool_],
@@ -437,44 +475,54 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
 
         All that can fail when an episode begins fails here, before the batch is changed.
         """
-        state = np.zeros((kernel.STATE_ROWS, len(which)))
-        integers = np.zeros((kernel.INTEGER_ROWS, len(which)), np.int64)
-        for name, row in _STATE_ROWS.items():
-            state[row] = parameters[_NUMBERS.index(name)]
-        mu_s, mu_m, v_m = (parameters[_NUMBERS.index(name)] for name in ("mu_s", "mu_m", "v_m"))
-        state[kernel.S_K1], state[kernel.S_K3] = stribeck_coefficients(mu_s, mu_m, v_m)
-        state[kernel.S_X], state[kernel.S_V] = x, v
-        integers[kernel.I_KEY], integers[kernel.I_EPISODE] = keys, episodes
-        integers[kernel.I_GEOMETRY], state[kernel.S_FRICTION] = kinds
-        hyperbolic = kinds[1] == kernel.HYPERBOLIC
-        state[kernel.S_DECAY, hyperbolic] = parameters[_NUMBERS.index("delta"), hyperbolic]
-        kernel.blank_episodes(state, integers, np.arange(len(which)))
-        own = (kinds != self._nominal_kinds).any(axis=0) | (parameters != self._nominal_numbers).any(axis=0)
-        beyond = bool((kinds[1] != kernel.STRIBECK).any() or (kinds[0] >= kernel.DUFFING).any())
-        beyond = beyond or bool(state[_AMPLITUDES].any())
-        starts = _Starts(which, parameters, state, integers, own, beyond)
-        self._place(starts, np.flatnonzero(~placed))
+        kinds = self._kinds_in(numbers, laws)
+        values = dict(zip(self._names, numbers, strict=True))
+        plants = [
+            kernel.leaves_of(
+                plant_of(kind, {name: rows[columns] for name, rows in values.items()}),
+                plant_of(kind, self.nominal.values),
+            )
+            for kind, columns in kinds
+        ]
+        state = np.zeros((kernel.STATE_PLANT + max(map(len, plants)), len(which)))
+        for (_, columns), leaves in zip(kinds, plants, strict=True):
+            for leaf, row in enumerate(leaves):
+                state[kernel.STATE_PLANT + leaf, columns] = row
+        state[kernel.STATE_BELT_SPEED] = values["belt_speed"]
+        state[kernel.STATE_X], state[kernel.STATE_V] = x, v
+        counts = np.zeros((kernel.COUNT_ROWS, len(which)), np.int64)
+        counts[kernel.COUNT_KEY], counts[kernel.COUNT_EPISODE] = keys, episodes
+        kernel.blank_episodes(state, counts, np.arange(len(which)))
+        own = (laws != 0) | (numbers != self._nominal_numbers).any(axis=0)
+        starts = _Starts(which, numbers, laws, kinds, state, counts, own)
+        self._place(starts, ~placed)
         return starts
 
     def _begin(self, starts: _Starts) -> None:
         """Start episodes; they are not observed yet."""
         which = starts.which
         here = slice(self.num_envs) if len(which) == self.num_envs else which  # in one go, where that is possible
-        beyond = kernel.NO_LAWS if starts.beyond or (self._beyond and len(which) < self.num_envs) else None
-        if beyond != self._beyond:
-            self._beyond = beyond
-            self._choose_stepper()
         self._numbers[:, here] = starts.numbers
-        self._state[:, here] = starts.state
-        self._integers[:, here] = starts.integers
+        self._law[here] = starts.laws
+        kinds = starts.kinds
+        if len(which) < self.num_envs:
+            kinds = self._kinds_in(self._numbers, self._law)
+        if [kind for kind, _ in kinds] != [kind for kind, _ in self._kinds]:
+            self._kinds = kinds
+            self._form_groups()
+        else:
+            self._kinds = kinds
+            self._groups = [group._replace(which=own) for group, (_, own) in zip(self._groups, kinds, strict=True)]
+        self._state[: len(starts.state), here] = starts.state
+        self._counts[:, here] = starts.counts
         self._own[here] = starts.own
         one_plant = not self._own.any()
-        if one_plant and not self._task_codes[kernel.T_ONE_PLANT]:
+        if one_plant and not self._task_codes[kernel.TASK_ONE_PLANT]:
             for work in self._works:
                 kernel.fill_plant(work, self._state[:, which[0]])
-        self._task_codes[kernel.T_ONE_PLANT] = one_plant
+        self._task_codes[kernel.TASK_ONE_PLANT] = one_plant
         if self.task.show_parameters:
-            self._shown[which] = self.task.shown_parameters(dict(zip(_NUMBERS, starts.numbers, strict=True))).T
+            self._shown[which] = self.task.shown_parameters(dict(zip(self._names, starts.numbers, strict=True))).T
         self._clear_pictures(which)
 
     def _clear_pictures(self, which: IntegerArray) -> None:
@@ -483,26 +531,29 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
                 self._views[i].clear_picture()
                 self._modes.pop(i, None)
 
-    def _place(self, starts: _Starts, columns: IntegerArray) -> None:
-        """Put the episodes in these columns where the task starts them."""
-        if len(columns) == 0:
-            return
-        task, state, integers = self.task, starts.state, starts.integers
-        keys, episodes = integers[kernel.I_KEY, columns], integers[kernel.I_EPISODE, columns]
+    def _place(self, starts: _Starts, asked: NDArray[np.bool_]) -> None:
+        """Put the episodes that are asked for where the task starts them."""
+        task, state, counts = self.task, starts.state, starts.counts
         if task.start == "random":
-            state[kernel.S_X, columns], state[kernel.S_V, columns] = task.random_states(keys, episodes)
+            columns = np.flatnonzero(asked)
+            keys, episodes = counts[kernel.COUNT_KEY, columns], counts[kernel.COUNT_EPISODE, columns]
+            state[kernel.STATE_X, columns], state[kernel.STATE_V, columns] = task.random_states(keys, episodes)
             return
-        own = starts.own[columns]
-        left = columns[own]
-        beyond = kernel.NO_LAWS if starts.beyond else None
-        kernel.place_on_cycle(state, integers, columns[~own], *self._nominal_start, beyond)
-        if task.start == "cycle":
-            phases = task.phases(keys, episodes)[own]
-            left = left[kernel.own_cycle_starts(state, integers, left, phases, beyond) == 1]
-        for j in left.tolist():
-            single = self._as_parameters(starts.numbers[:, j], _kinds(state, integers, j))
-            key, episode = integers[[kernel.I_KEY, kernel.I_EPISODE], j].tolist()
-            state[kernel.S_X, j], state[kernel.S_V, j] = task.start_state(single, key, episode)
+        left = []
+        for kind, columns in starts.kinds:
+            group = self._group(kind, columns)
+            nominal = columns[asked[columns] & ~starts.own[columns]]
+            own = columns[asked[columns] & starts.own[columns]]
+            if len(nominal):
+                group.steppers.place_on_cycle(state, counts, nominal, *self._nominal_start, group.tables)
+            if task.start == "cycle" and len(own):
+                phases = task.phases(counts[kernel.COUNT_KEY, own], counts[kernel.COUNT_EPISODE, own])
+                own = own[group.steppers.own_cycle_starts(state, counts, own, phases, group.tables) == 1]
+            left += own.tolist()
+        for j in left:
+            single = self._as_parameters(starts.numbers[:, j], int(starts.laws[j]))
+            key, episode = counts[[kernel.COUNT_KEY, kernel.COUNT_EPISODE], j].tolist()
+            state[kernel.STATE_X, j], state[kernel.STATE_V, j] = task.start_state(single, key, episode)
 
     @functools.cached_property
     def _nominal_start(self) -> tuple[FloatArray, float, int]:
@@ -517,25 +568,29 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         return np.array([place] * kernel.CYCLE_POINTS), 0.0, PHASE_SLOT
 
     def _observe(self, which: IntegerArray) -> None:
-        kernel.observe(
-            self._task_numbers,
-            self._task_codes,
-            self._state,
-            self._integers,
-            self._past,
-            self._shown,
-            self._observations,
-            which,
-        )
+        arrays = (self._task_numbers, self._task_codes, self._state, self._counts, self._past, self._shown)
+        for group, own in self._in_groups(which):
+            group.steppers.observe(*arrays, group.tables, self._observations, own)
+
+    def _in_groups(self, which: IntegerArray) -> list[tuple[_Group, IntegerArray]]:
+        """Return the groups to which environments belong, with these."""
+        if len(self._groups) == 1:
+            return [(self._groups[0], which)]
+        parts = [(group, which[np.isin(which, group.which)]) for group in self._groups]
+        return [(group, own) for group, own in parts if len(own)]
 
     def _at_start(self, which: IntegerArray) -> dict[str, NDArray[Any]]:
         """Return what info says of environments (k,) that have just been reset, each (k,)."""
         state = self._state
         mode, (v_belt, v_rel, normal_force) = np.empty(len(which), np.int64), np.empty((3, len(which)))
-        kernel.contact(state, self._integers, which, mode, v_belt, v_rel, normal_force, self._beyond)
+        for group, own in self._in_groups(which):
+            here = np.searchsorted(which, own) if len(own) < len(which) else slice(None)
+            parts = [np.empty(len(own), out.dtype) for out in (mode, v_belt, v_rel, normal_force)]
+            group.steppers.contact(state, self._counts, own, *parts, group.tables)
+            mode[here], v_belt[here], v_rel[here], normal_force[here] = parts
         return {
-            "x": state[kernel.S_X, which],
-            "v": state[kernel.S_V, which],
+            "x": state[kernel.STATE_X, which],
+            "v": state[kernel.STATE_V, which],
             "v_belt": v_belt,
             "v_rel": v_rel,
             "mode": mode,
@@ -546,11 +601,11 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
     def _reset_info(self, which: IntegerArray, start: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         mask = self._mask(which)
         info = self._spread(start, which, mask)
-        geometries = self._integers[kernel.I_GEOMETRY, which]
-        geometries[geometries == kernel.DISCONTINUOUS] = kernel.EXACT
-        frictions = self._state[kernel.S_FRICTION, which].astype(np.int64)
-        parameters = {"geometry": geometries, "friction": frictions}
-        parameters.update(zip(_NUMBERS, self._numbers[:, which], strict=True))
+        parameters: dict[str, NDArray[Any]] = {}
+        for place, (name, names) in enumerate({"geometry": GEOMETRIES, "friction": FRICTIONS}.items()):
+            places = np.array([place_of(laws[place], names) for laws in self._laws])
+            parameters[name] = places[self._law[which]]
+        parameters.update(zip(self._names, self._numbers[:, which], strict=True))
         return info | {"parameters": self._spread(parameters, which, mask), "_parameters": mask}
 
     def _spread(
@@ -644,7 +699,7 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
             for name, row in _CODES.items():
                 said[name] = out.codes[row, :n]
         if self._status_wanted:
-            said["status"] = self._integers[kernel.I_STATUS, :n].copy()
+            said["status"] = self._counts[kernel.COUNT_STATUS, :n].copy()
         return said
 
     def _checked_actions(self, actions: Any) -> FloatArray:
@@ -675,23 +730,57 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
 
     def _advance(self, actions: FloatArray, out: _Buffers) -> int:
         """Step all environments; return how many are at an episode's end."""
+        if len(self._groups) > 1:
+            return sum(self._advance_group(group, actions, out) for group in self._groups)
+        group = self._groups[0]
         arguments = (
             self._task_numbers,
             self._task_codes,
             self._state,
-            self._integers,
+            self._counts,
             self._past,
             self._shown,
+            group.tables,
             actions,
             self._wanted,
             self._observations,
             *out,
         )
         if len(self._works) == 1 or _threads_are_lost:
-            ended: int = self._stepper(self._works[0], 0, self.num_envs, *arguments)
+            ended: int = group.steppers.step_many(self._works[0], 0, self.num_envs, *arguments)
             return ended
-        self._stepper_in_threads(self._works, self._bounds, self._ended, *arguments)
+        group.steppers.step_in_threads(self._works, self._bounds, self._ended, *arguments)
         return int(self._ended.sum())
+
+    def _advance_group(self, group: _Group, actions: FloatArray, out: _Buffers) -> int:
+        """Step the environments of one group of several: their columns are brought together and put back."""
+        own = group.which
+        columns = (self._state, self._counts, self._past, out.over, out.report, out.codes)
+        state, counts, past, over, report, codes = (np.ascontiguousarray(array[..., own]) for array in columns)
+        observations, rewards = self._observations[own], out.rewards[own]
+        ended: int = group.steppers.step_many(
+            np.ones(group.steppers.work_size),
+            0,
+            len(own),
+            self._task_numbers,
+            self._task_codes,
+            state,
+            counts,
+            past,
+            self._shown[own],
+            group.tables,
+            actions[own],
+            self._wanted,
+            observations,
+            rewards,
+            over,
+            report,
+            codes,
+        )
+        for array, part in zip(columns, (state, counts, past, over, report, codes), strict=True):
+            array[..., own] = part
+        self._observations[own], out.rewards[own] = observations, rewards
+        return ended
 
     def _replace_rewards(self, said: Mapping[str, Any], resting: IntegerArray, rewards: FloatArray) -> None:
         assert self.reward is not None
@@ -700,17 +789,24 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         for i in range(self.num_envs):
             if i not in quiet:
                 rewards[i] = float(self.reward({name: values[i] for name, values in columns.items()}))
-        self._state[kernel.S_RETURN, : self.num_envs] += rewards
+        self._state[kernel.STATE_RETURN, : self.num_envs] += rewards
 
     def _next_starts(self, which: IntegerArray) -> _Starts | None:
         """Return the next episodes of environments; None if compiled code alone can begin them."""
         if self._restarts_alike and not self._own[which].any():
             _ = self._nominal_start  # which may fail, and must do so now
             return None
-        keys, episodes = self._integers[kernel.I_KEY, which], self._integers[kernel.I_EPISODE, which] + 1
+        keys, episodes = self._counts[kernel.COUNT_KEY, which], self._counts[kernel.COUNT_EPISODE, which] + 1
         nowhere = np.zeros(len(which))
         return self._prepared(
-            which, keys, episodes, *self._drawn(keys, episodes), nowhere, nowhere, np.zeros(len(which), np.bool_)
+            which,
+            keys,
+            episodes,
+            self._drawn(keys, episodes),
+            np.zeros(len(which), np.int64),
+            nowhere,
+            nowhere,
+            np.zeros(len(which), np.bool_),
         )
 
     def _restart(self, which: IntegerArray, starts: _Starts | None) -> None:
@@ -719,18 +815,9 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
             self._begin(starts)
             self._observe(which)
             return
-        kernel.restart(
-            self._task_numbers,
-            self._task_codes,
-            self._state,
-            self._integers,
-            self._past,
-            self._shown,
-            self._observations,
-            which,
-            *self._nominal_start,
-            self._beyond,
-        )
+        arrays = (self._task_numbers, self._task_codes, self._state, self._counts, self._past, self._shown)
+        for group, own in self._in_groups(which):  # one: all have the nominal parameters
+            group.steppers.restart(*arrays, group.tables, self._observations, own, *self._nominal_start)
         self._clear_pictures(which)
 
     def _show_restarted(self, info: dict[str, Any], which: IntegerArray) -> None:
@@ -760,7 +847,7 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
     def _statistics(self, which: IntegerArray) -> dict[str, Any]:
         """Return what info says of the episodes of environments that have ended."""
         values = np.zeros((len(EPISODE_STATISTICS), self.num_envs))
-        kernel.episode_statistics(self._state, self._integers, which, self.reward is not None, values)
+        kernel.episode_statistics(self._state, self._counts, which, self.reward is not None, values)
         mask = self._mask(which)
         statistics: dict[str, Any] = {}
         for name, entries in named_statistics(values).items():
@@ -780,8 +867,8 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         if not self._is_reset:
             raise gym.error.ResetNeeded("call reset() before stagger(): no episode is running")
         steps = self._everyone * self.task.episode_steps // self.num_envs
-        self._integers[kernel.I_STEPS, : self.num_envs] = steps
-        self._integers[kernel.I_FIRST_STEP, : self.num_envs] = steps
+        self._counts[kernel.COUNT_STEPS, : self.num_envs] = steps
+        self._counts[kernel.COUNT_FIRST_STEP, : self.num_envs] = steps
 
     # One by one -------------------------------------------------------------------------------------------------------
 
@@ -801,8 +888,8 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         return tuple(self._state_of(i) for i in range(self.num_envs))
 
     def _state_of(self, i: int) -> EnvState:
-        parameters = self._as_parameters(self._numbers[:, i], _kinds(self._state, self._integers, i))
-        return read_state(parameters, self._state, self._integers, self._past, i)
+        parameters = self._as_parameters(self._numbers[:, i], int(self._law[i]))
+        return read_state(parameters, self._state, self._counts, self._past, i)
 
     def set_states(self, states: Sequence[EnvState]) -> None:
         """Go back to states that :meth:`get_states` returned: what follows is the same, bit for bit.
@@ -824,15 +911,16 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
 
     def _put_states(self, which: IntegerArray, states: Sequence[EnvState]) -> None:
         """Put (checked) states into environments."""
-        numbers = np.array([[getattr(saved.parameters, name) for saved in states] for name in _NUMBERS])
-        kinds = np.hstack([_kinds_of(saved.parameters) for saved in states])
+        columns = [self._columns_of(saved.parameters) for saved in states]
+        numbers = np.array([column for column, _ in columns]).T
+        laws = np.array([law for _, law in columns])
         keys = np.array([saved.key for saved in states])
         episodes = np.array([saved.episode for saved in states])
         elsewhere = np.zeros(len(which))  # write_state puts them in their places
         everywhere = np.ones(len(which), np.bool_)
-        self._begin(self._prepared(which, keys, episodes, numbers, kinds, elsewhere, elsewhere, everywhere))
+        self._begin(self._prepared(which, keys, episodes, numbers, laws, elsewhere, elsewhere, everywhere))
         for i, saved in zip(which.tolist(), states, strict=True):
-            write_state(saved, self._state, self._integers, self._past, i)
+            write_state(saved, self._state, self._counts, self._past, i)
         over = np.array([saved.ended or saved.steps >= self.task.episode_steps for saved in states])
         self._over = np.union1d(self._over[~np.isin(self._over, which)], which[over])
 

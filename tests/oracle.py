@@ -66,6 +66,8 @@ class Parameters(Protocol):
     @property
     def kappa(self) -> float: ...
     @property
+    def linear_stiffness(self) -> float: ...
+    @property
     def force_amplitude(self) -> float: ...
     @property
     def force_frequency(self) -> float: ...
@@ -103,6 +105,7 @@ class Plant:
     v_0: float = 0.5
     mu_v: float = 0.0
     kappa: float = 1.0
+    linear_stiffness: float = 1.0
     force_amplitude: float = 0.0
     force_frequency: float = 1.0
     force_phase: float = 0.0
@@ -197,7 +200,7 @@ class Equilibrium(NamedTuple):
 def _check(p: Parameters) -> None:
     if p.geometry not in ("exact", "cubic", "linear", "duffing"):
         raise ValueError(f"unknown geometry {p.geometry!r}")
-    if p.friction not in ("stribeck", "coulomb", "hyperbolic", "exponential"):
+    if p.friction not in ("stribeck", "coulomb", "hyperbolic", "exponential", "gaussian"):
         raise ValueError(f"unknown friction {p.friction!r}")
     if p.geometry == "cubic" and p.alpha <= 0.0:
         raise ValueError("the cubic spring needs a positive alpha")
@@ -256,7 +259,7 @@ def _calm_restoring(p: Parameters, x: Any, side: float | None) -> Any:
     if p.geometry == "cubic":
         return x - x / p.alpha + x**3 / (2.0 * p.alpha**3)
     if p.geometry == "duffing":
-        return x + p.kappa * x**3
+        return p.linear_stiffness * x + p.kappa * x**3
     return 1.0 * x
 
 
@@ -267,7 +270,7 @@ def restoring_slope(p: Parameters, x: Any) -> Any:
     if p.geometry == "cubic":
         return 1.0 - 1.0 / p.alpha + 3.0 * x**2 / (2.0 * p.alpha**3)
     if p.geometry == "duffing":
-        return 1.0 + 3.0 * p.kappa * x**2
+        return p.linear_stiffness + 3.0 * p.kappa * x**2
     return 0.0 * x + 1.0
 
 
@@ -278,7 +281,7 @@ def potential(p: Parameters, x: Any) -> Any:
     if p.geometry == "cubic":
         return 0.5 * x * x * (1.0 - 1.0 / p.alpha) + x**4 / (8.0 * p.alpha**3)
     if p.geometry == "duffing":
-        return 0.5 * x * x + 0.25 * p.kappa * x**4
+        return 0.5 * p.linear_stiffness * x * x + 0.25 * p.kappa * x**4
     return 0.5 * x * x
 
 
@@ -312,9 +315,11 @@ def friction_coefficient(p: Parameters, w: Any, mode: int | None = None) -> Any:
     if p.friction == "coulomb":
         return p.mu_k * sign + 0.0 * w
     if p.friction == "hyperbolic":
-        return p.mu_s * sign / (1.0 + p.delta * sign * w)
+        return p.mu_s * sign / (1.0 + p.delta * sign * w) + p.mu_v * w
     if p.friction == "exponential":
         return sign * (p.mu_k + (p.mu_s - p.mu_k) * np.exp(-sign * w / p.v_0)) + p.mu_v * w
+    if p.friction == "gaussian":
+        return sign * (p.mu_k + (p.mu_s - p.mu_k) * np.exp(-((w / p.v_0) ** 2))) + p.mu_v * w
     k1, k3 = _stribeck(p)
     return p.mu_s * sign - k1 * w + k3 * w**3
 
@@ -324,9 +329,11 @@ def friction_slope(p: Parameters, w: Any) -> Any:
     if p.friction == "coulomb":
         return 0.0 * w
     if p.friction == "hyperbolic":
-        return -p.mu_s * p.delta / (1.0 + p.delta * abs(w)) ** 2
+        return p.mu_v - p.mu_s * p.delta / (1.0 + p.delta * abs(w)) ** 2
     if p.friction == "exponential":
         return p.mu_v - (p.mu_s - p.mu_k) / p.v_0 * np.exp(-abs(w) / p.v_0)
+    if p.friction == "gaussian":
+        return p.mu_v - 2.0 * (p.mu_s - p.mu_k) * abs(w) / p.v_0**2 * np.exp(-((w / p.v_0) ** 2))
     k1, k3 = _stribeck(p)
     return -k1 + 3.0 * k3 * w**2
 

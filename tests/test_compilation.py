@@ -11,20 +11,21 @@ from pathlib import Path
 import pytest
 
 import sd_friction_env
-from sd_friction_env import OscillatorParameters, compilation, kernel, limit_cycle
+from sd_friction_env import OscillatorParameters, kernel, limit_cycle
+from sd_friction_env.kernel import compilation
 
 pytestmark = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="nothing is compiled")
 
 PACKAGE = Path(sd_friction_env.__file__).parent
 NOWHERE = "/dev/null/nowhere"  # below a file nobody can make a folder, not even root
 SOURCE = """
-from sd_friction_env.compilation import compiled
+from sd_friction_env.kernel.compilation import entry
 
-@compiled
+@entry
 def add(x):
     return x + 1
 
-@compiled
+@entry
 def twice(x):
     return 2 * add(x)
 """
@@ -126,9 +127,9 @@ def test_a_file_of_another_signature_function_or_source_is_not_taken_for_it(modu
     assert again(module).twice(3) == 10
 
 
-def test_an_edit_of_the_decorators_renews_the_code(module, monkeypatch):
+def test_an_edit_in_the_kernel_renews_the_code(module, monkeypatch):
     assert module.twice(3) == 8
-    monkeypatch.setattr(compilation, "_OWN_SOURCE", b"other options")
+    monkeypatch.setattr(compilation, "_SOURCES", b"an edited file")
     other = again(module)
     assert other.twice(3) == 8
     assert hits(other.twice) == (0, 1)
@@ -152,8 +153,7 @@ def test_only_what_is_compiled_is_announced_once_and_with_the_seconds(module, ca
 
 
 def test_the_announcement_of_the_kernel_counts_what_it_calls():
-    limit_cycle(OscillatorParameters())
-    assert len(list(compilation._bytecode_to_compile(kernel.settle))) > 30
+    assert len(list(compilation._bytecode_to_compile(kernel.iterate_to_attractor, [object()]))) > 30
 
 
 def run(code, folder, **environment):
@@ -202,7 +202,8 @@ def copied(tmp_path, *, with_cache):
 
 def test_the_doctor_works_without_a_folder_for_compiled_code(tmp_path):
     package = copied(tmp_path, with_cache=False)
-    (package / "__pycache__").write_text("a file")
+    for folder in (package / "kernel", package / "kernel" / "friction"):
+        (folder / "__pycache__").write_text("a file")
     nowhere = {"HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE, "NUMBA_CACHE_DIR": NOWHERE}
     process = run(["-m", "sd_friction_env", "doctor"], tmp_path, **nowhere)
     assert process.stdout.readline().split() == ["sd_friction_env", sd_friction_env.__version__]  # before it compiles
@@ -211,15 +212,15 @@ def test_the_doctor_works_without_a_folder_for_compiled_code(tmp_path):
     assert "limit cycle of amplitude 0.3934432611" in out
     assert f"compiled code    {compilation.NO_FOLDER}" in out
     assert error.count("NUMBA_CACHE_DIR") == 1
-    assert "compiling settle, about" in error
+    assert "compiling iterate_to_attractor, about" in error
 
 
 def test_the_doctor_works_with_damaged_files_and_names_the_folder_in_use(tmp_path):
     package = copied(tmp_path, with_cache=True)
-    folder = package / "__pycache__" if os.environ.get("NUMBA_CACHE_DIR") is None else None
-    if folder is None or not list(folder.glob("kernel.*.nbc")):
+    folder = package / "kernel" / "__pycache__" if os.environ.get("NUMBA_CACHE_DIR") is None else None
+    if folder is None or not list(folder.glob("*.nbc")):
         pytest.skip("the cache of these tests is elsewhere")
-    damaged = [*folder.glob("kernel.stick_slip_lap-*.nbc"), *folder.glob("kernel.slip_across-*.nbi")]
+    damaged = [*folder.glob("return_map.stick_slip_lap-*.nbc"), *folder.glob("slip.slip_across-*.nbi")]
     assert len(damaged) >= 2
     for file in damaged:
         file.write_bytes(file.read_bytes()[:-100])
@@ -229,6 +230,62 @@ def test_the_doctor_works_with_damaged_files_and_names_the_folder_in_use(tmp_pat
     found = json.loads(out)
     assert found["kernel"]["amplitude"] == limit_cycle(OscillatorParameters()).amplitude
     assert found["cache"]["folder"] == str(folder)
-    assert found["cache"]["files"] == len(list(folder.glob("kernel.*.nb[ic]")))
+    assert found["cache"]["files"] == len(list(folder.glob("*.nb[ic]")))
     assert error.count("damaged") == 1
     assert str(folder) in error
+
+
+OWN = """
+from typing import NamedTuple
+from sd_friction_env import friction_law
+
+@friction_law
+class Level(NamedTuple):
+    mu_s: float
+
+    def coefficient(self, mode, v_rel):
+        return mode * self.mu_s
+
+    def slope(self, mode, v_rel):
+        return 0.0
+
+    def curvature(self, mode, v_rel):
+        return 0.0
+
+    def third_derivative(self, mode, v_rel):
+        return 0.0
+
+    def breakaway_coefficient(self, mode):
+        return self.mu_s
+"""
+ASK = """
+from own import Level
+from sd_friction_env import OscillatorParameters, kernel
+p = OscillatorParameters(geometry="linear", friction=Level(0.5))
+mode, _, _, normal = kernel.left_alone(p.plant, 0.2, 0.1, 0.1)
+print(mode, normal, *kernel.left_alone.stats.cache_hits.values())
+"""
+
+
+def test_an_edit_of_a_callee_in_another_file_or_of_a_users_law_renews_the_caller(tmp_path):
+    package = tmp_path / "sd_friction_env"
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    if (PACKAGE.parent / "agents" / "hyperparameters").is_dir():
+        shutil.copytree(PACKAGE.parent / "agents" / "hyperparameters", tmp_path / "agents" / "hyperparameters")
+    law, spring = tmp_path / "own.py", package / "kernel" / "springs" / "linear.py"
+    law.write_text(OWN)
+
+    def told():
+        out, error = run(ASK, tmp_path, NUMBA_CACHE_DIR="").communicate(timeout=300)
+        assert out, error
+        return out.split()
+
+    assert told() == ["0", "1.0"]
+    assert told() == ["0", "1.0", "1"]  # from the cache
+    law.write_text(
+        OWN.replace("return self.mu_s\n", "return 0.1 * self.mu_s\n").replace("mode * self.mu_s", "0.05 * mode")
+    )
+    assert told() == ["-1", "1.0"]
+    assert told() == ["-1", "1.0", "1"]
+    spring.write_text(spring.read_text() + "\n    def normal_force(self, weight, x):\n        return 3.0 * weight\n")
+    assert told() == ["-1", "3.0"]

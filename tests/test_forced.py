@@ -38,11 +38,11 @@ BENT = OscillatorParameters(geometry="duffing", mu_s=0.0, mu_m=0.0, force_amplit
 
 
 def general(p, time=0.0):
-    return p.plant._replace(laws=p.laws(time))
+    return p.excited_plant(time)
 
 
 def ends(p, x, v, duration, time=0.0):
-    out = kernel.advance(general(p, time), x, v, p.belt_speed, 0.0, 0.0, duration, None)
+    out = kernel.advance(general(p, time), kernel.State(x, v), kernel.Drive(p.belt_speed, 0.0, 0.0), duration, None)
     assert out[4] == kernel.OK
     return np.array(out[:2])
 
@@ -59,9 +59,9 @@ def differences(p, x, v, duration, time=0.0, h=1e-6):
 def tangents(p, x, v, duration, time=0.0):
     """The tangent map, and the kinds of the events on the way."""
     vectors, events = np.eye(2), np.empty((kernel.MAX_EVENTS, 4))
-    out = kernel.walk(general(p, time), x, v, p.belt_speed, duration, events, vectors)
+    out = kernel.integrate_with_tangents(general(p, time), x, v, p.belt_speed, duration, events, vectors)
     assert out[3] == kernel.OK
-    n = kernel.advance(general(p, time), x, v, p.belt_speed, 0.0, 0.0, duration, events)[6]
+    n = kernel.advance(general(p, time), kernel.State(x, v), kernel.Drive(p.belt_speed, 0.0, 0.0), duration, events)[6]
     return vectors.T, [int(kind) for kind in events[:n, 1]]
 
 
@@ -116,7 +116,12 @@ def test_the_tangent_map_is_what_differences_of_the_automaton_say(name):
     met, smooth = set(), 0
     for _ in range(60):
         start = x + rng.uniform(-1.0, 1.0), v + rng.uniform(-0.7, 0.7), 2.0 * math.pi / 1.1, rng.uniform(0.0, 6.0)
-        if kernel.advance(general(p, start[3]), *start[:2], p.belt_speed, 0.0, 0.0, start[2], None)[4] != kernel.OK:
+        if (
+            kernel.advance(
+                general(p, start[3]), kernel.State(*start[:2]), kernel.Drive(p.belt_speed, 0.0, 0.0), start[2], None
+            )[4]
+            != kernel.OK
+        ):
             continue  # contact lost
         exact, kinds = tangents(p, *start)
         found, coarser = differences(p, *start), differences(p, *start, h=3e-6)
@@ -136,7 +141,7 @@ def test_a_stick_leaves_one_direction_and_a_crossing_scales_by_the_accelerations
     plant = general(p)
     assert kernel.saltation(plant, -1, 0, kernel.RESTICK, 0.5, 0.2, 0.2) == (0.0, 0.0, False)
     # by hand, mode -1: a = mu_k N - 2 beta v - R + f; mode 1 has -mu_k N
-    restoring, normal = kernel.spring(plant, 0.5)
+    restoring, normal = kernel.restoring_force(plant, 0.5), kernel.normal_force(plant, 0.5)
     rest = -2.0 * p.beta * 0.2 - restoring + p.force_amplitude
     ratio = (rest - 0.1 * normal) / (rest + 0.1 * normal)
     assert kernel.saltation(plant, -1, 1, kernel.CROSSING, 0.5, 0.2, 0.2) == pytest.approx((0.0, ratio, False))
@@ -236,9 +241,11 @@ def test_two_neighbours_part_as_fast_as_the_exponent_says():
     (x, v), other = ON_THE_CHAOS, (ON_THE_CHAOS[0] + apart, ON_THE_CHAOS[1])
     logs = []
     for n in range(4200):
-        now = kernel.later(plant, n * period)
-        x, v = kernel.advance(now, x, v, CHAOTIC.belt_speed, 0.0, 0.0, period, None)[:2]
-        beside = kernel.advance(now, other[0], other[1], CHAOTIC.belt_speed, 0.0, 0.0, period, None)[:2]
+        now = kernel.at_time(plant, n * period)
+        x, v = kernel.advance(now, kernel.State(x, v), kernel.Drive(CHAOTIC.belt_speed, 0.0, 0.0), period, None)[:2]
+        beside = kernel.advance(
+            now, kernel.State(other[0], other[1]), kernel.Drive(CHAOTIC.belt_speed, 0.0, 0.0), period, None
+        )[:2]
         gap = np.array(beside) - (x, v)
         size = np.hypot(*gap)
         logs.append(math.log(size / apart))
@@ -395,7 +402,7 @@ p = OscillatorParameters(alpha=0.6, friction="coulomb", belt_speed=0.3, force_am
                          ripple_amplitude=0.1, ripple_frequency=1.1, stiffness_amplitude=0.2, stiffness_frequency=1.1)
 rows, growth = np.empty((3, kernel.CYCLE_ROW)), np.empty((3, 2))
 out = kernel.stroboscope(p.plant, 0.5, -0.3, 0.3, 5.711986642890533, 0, rows, growth)
-assert rows[:, kernel.R_STICKS].sum() > 0
+assert rows[:, kernel.CYCLE_STICKS].sum() > 0
 print(struct.pack("20d", *out[:2], *rows[:, [0, 1, 3, 6]].ravel(), *growth.ravel()).hex())
 """
 

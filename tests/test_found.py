@@ -204,7 +204,7 @@ def test_a_mass_that_breaks_away_and_lands_before_it_loses_contact_lands():
     p = p.replace(belt_speed=3.1782599899631805)
     steps.examine(p, start)
     events = np.zeros((256, 4))
-    end = kernel.advance(p.plant, *start[:5], 0.1, events)
+    end = kernel.advance(p.plant, kernel.State(*start[:2]), kernel.Drive(*start[2:5]), 0.1, events)
     with np.errstate(all="ignore"):
         wanted = oracle.run(p, start.x, start.v, [(0.1, 0.0, acceleration)], speed)
     kinds = ["restick", "breakaway", "contact-loss"]

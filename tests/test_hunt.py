@@ -57,7 +57,7 @@ def test_a_trial_depends_on_its_seed_and_index_alone():
 def test_plants_are_drawn_over_the_whole_range():
     plants = [draws.plant(draws.generator(0, index)) for index in range(2000)]
     kinds = {(p.geometry, p.friction) for p in plants}
-    assert len(kinds) == 16
+    assert len(kinds) == 20
     assert {p.alpha for p in plants if p.geometry == "exact"} >= {0.0, 0.001, 10.0}
     assert {p.beta for p in plants} >= {0.0, 10.0}
     assert any(p.mu_m == p.mu_s > 0.0 and p.friction == "stribeck" for p in plants)

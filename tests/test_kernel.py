@@ -20,14 +20,18 @@ LINEAR = OscillatorParameters(geometry="linear").plant
 PLANTS = {"exact": EXACT, "cubic": CUBIC, "linear": LINEAR}
 
 
+def spring(plant, x):
+    return kernel.restoring_force(plant, x), kernel.normal_force(plant, x)
+
+
 def test_spring_laws_agree_with_hand_computed_values():
     # exact at x = .6, alpha = .8: the spring has its free length, so it pulls nowhere
-    assert kernel.spring(EXACT, 0.6) == pytest.approx((0.0, 1.0), abs=1e-16)
+    assert spring(EXACT, 0.6) == pytest.approx((0.0, 1.0), abs=1e-16)
     # exact at x = 1.5: length 1.7, R = 1.5 (.7/1.7), N = 1 - .8 (.7/1.7)
-    assert kernel.spring(EXACT, 1.5) == pytest.approx((1.05 / 1.7, 1.0 - 0.56 / 1.7), rel=1e-15)
+    assert spring(EXACT, 1.5) == pytest.approx((1.05 / 1.7, 1.0 - 0.56 / 1.7), rel=1e-15)
     # cubic at x = .8 = alpha: R = .8 - 1 + 1/2, N = 1 - .8 + 1 - 1/2
-    assert kernel.spring(CUBIC, 0.8) == pytest.approx((0.3, 0.7), rel=1e-15)
-    assert kernel.spring(LINEAR, -0.7) == (-0.7, 1.0)
+    assert spring(CUBIC, 0.8) == pytest.approx((0.3, 0.7), rel=1e-15)
+    assert spring(LINEAR, -0.7) == (-0.7, 1.0)
 
 
 def test_friction_falls_from_mu_s_to_mu_m_at_v_m_and_rises_again():
@@ -43,18 +47,18 @@ def test_friction_falls_from_mu_s_to_mu_m_at_v_m_and_rises_again():
 @pytest.mark.parametrize("x", [-1.1, -0.3, 0.0, 0.45, 1.2])
 def test_slopes_and_potential_are_those_of_the_forces(geometry, x):
     plant, h = PLANTS[geometry], 1e-5
-    above, below = kernel.spring(plant, x + h), kernel.spring(plant, x - h)
+    above, below = spring(plant, x + h), spring(plant, x - h)
     slopes = [(a - b) / (2.0 * h) for a, b in zip(above, below, strict=True)]
-    assert kernel.spring_slopes(plant, x) == pytest.approx(slopes, abs=1e-9)
+    assert (kernel.restoring_slope(plant, x), kernel.normal_slope(plant, x)) == pytest.approx(slopes, abs=1e-9)
     force = (kernel.potential(plant, x + h) - kernel.potential(plant, x - h)) / (2.0 * h)
-    assert kernel.spring(plant, x)[0] == pytest.approx(force, abs=1e-9)
+    assert kernel.restoring_force(plant, x) == pytest.approx(force, abs=1e-9)
 
 
 def test_a_slip_step_is_of_eighth_order():
     def end(steps, h):
         x, v = 0.9, 0.1
         for _ in range(steps):
-            x, v, *_ = kernel.slip_step(CUBIC, -1, x, v, 0.2, 0.0, 0.01, h)
+            x, v, *_ = kernel.slip_step(CUBIC, -1, kernel.State(x, v), kernel.Drive(0.2, 0.0, 0.01), h)
         return x, v
 
     reference = end(128, 1.0 / 128)
@@ -72,19 +76,22 @@ def test_the_estimate_does_not_promise_more_than_a_step_keeps():
         ).plant
         x, v, h = rng.uniform(-1, 1), rng.uniform(-0.6, 0.15), 0.125
         while True:
-            x_end, v_end, _, _, estimate, _, _ = kernel.slip_step(plant, -1, x, v, 0.2, 0.0, 0.0, h)
+            x_end, v_end, _, _, estimate, _, _ = kernel.slip_step(
+                plant, -1, kernel.State(x, v), kernel.Drive(0.2, 0.0, 0.0), h
+            )
             if estimate <= kernel.TOLERANCE * h * max(1.0, abs(x), abs(v)):
                 break
             h *= 0.5
         fine = (x, v)
         for _ in range(8):
-            fine = kernel.slip_step(plant, -1, *fine, 0.2, 0.0, 0.0, h / 8)[:2]
+            fine = kernel.slip_step(plant, -1, kernel.State(*fine), kernel.Drive(0.2, 0.0, 0.0), h / 8)[:2]
         assert max(abs(x_end - fine[0]), abs(v_end - fine[1])) <= 1e-9 * h + 2e-15
 
 
 def test_no_corner_of_what_is_accepted_defeats_the_error_rule():
     rng = np.random.default_rng(0)
-    corners = {name: ends for name, ends in RANGES.items() if not name.endswith("scale")}
+    corners = {name: ends for name, ends in RANGES.items() if not name.endswith(("scale", "linear_stiffness"))}
+    corners["kappa"] = (0.0, 10.0)  # a spring that softens lets a mass escape in finite time
     for _ in range(1500):
         values = {}
         for name, (low, high) in corners.items():
@@ -100,14 +107,16 @@ def test_no_corner_of_what_is_accepted_defeats_the_error_rule():
         if rng.integers(2):
             p = p.unexcited.replace(friction="stribeck")
         x, v = rng.uniform(-STATE_LIMIT, STATE_LIMIT, 2)
-        out = kernel.advance(p.plant, x, v, p.belt_speed, 0.0, 0.0, 0.1, None)
+        out = kernel.advance(p.plant, kernel.State(x, v), kernel.Drive(p.belt_speed, 0.0, 0.0), 0.1, None)
         assert out[4] in (kernel.OK, kernel.CONTACT_LOST), (p, x, v)
         assert np.isfinite(out).all()
 
 
 def test_a_stuck_mass_moves_with_an_accelerating_belt_exactly():
     v_belt, a_belt, t = 0.2, -0.1, 0.1
-    x, v, belt, mode, status, *_ = kernel.advance(EXACT, 0.5, v_belt, v_belt, a_belt, 0.0, t, None)
+    x, v, belt, mode, status, *_ = kernel.advance(
+        EXACT, kernel.State(0.5, v_belt), kernel.Drive(v_belt, a_belt, 0.0), t, None
+    )
     assert (mode, status) == (kernel.STICK, kernel.OK)
     assert v == belt == v_belt + a_belt * t
     assert x == pytest.approx(0.5 + v_belt * t + 0.5 * a_belt * t * t, abs=2e-16)
@@ -115,15 +124,17 @@ def test_a_stuck_mass_moves_with_an_accelerating_belt_exactly():
 
 def test_a_hard_braked_belt_sheds_the_mass_forward():
     # load = a_belt + 2 beta v_b + R(.6) = -1 + .02, beyond mu_s N = .2: the mass runs ahead
-    _, _, _, mode, *_ = kernel.advance(EXACT, 0.6, 0.2, 0.2, -1.0, 0.0, 0.01, None)
+    _, _, _, mode, *_ = kernel.advance(EXACT, kernel.State(0.6, 0.2), kernel.Drive(0.2, -1.0, 0.0), 0.01, None)
     assert mode == kernel.SLIP_FORWARD
-    assert kernel.mode_at_zero_v_rel(EXACT, 0.6, 0.2, 1.0, 0.0) == kernel.SLIP_BACKWARD
-    assert kernel.mode_at_zero_v_rel(EXACT, 0.6, 0.2, 1.0, 1.0) == kernel.STICK
+    assert kernel.mode_at_zero_v_rel(EXACT, 0.6, kernel.Drive(0.2, 1.0, 0.0)) == kernel.SLIP_BACKWARD
+    assert kernel.mode_at_zero_v_rel(EXACT, 0.6, kernel.Drive(0.2, 1.0, 1.0)) == kernel.STICK
 
 
 def test_breakaway_on_the_linear_belt_is_at_mu_s_minus_2_beta_v_b():
     events = np.empty((8, 4))
-    _, _, _, _, status, _, n, *_ = kernel.advance(LINEAR, 0.0, 0.2, 0.2, 0.0, 0.0, 1.0, events)
+    _, _, _, _, status, _, n, *_ = kernel.advance(
+        LINEAR, kernel.State(0.0, 0.2), kernel.Drive(0.2, 0.0, 0.0), 1.0, events
+    )
     assert (status, n) == (kernel.OK, 1)
     assert events[0].tolist() == pytest.approx([0.9, kernel.BREAKAWAY, 0.18, 0.2], abs=1e-13)
 
@@ -131,11 +142,11 @@ def test_breakaway_on_the_linear_belt_is_at_mu_s_minus_2_beta_v_b():
 def test_loss_of_contact_is_reported_where_the_normal_force_vanishes():
     # cubic alpha = .2: N = 1.8 - x^2/.08 vanishes at x = sqrt(.144)
     plant = OscillatorParameters(geometry="cubic", alpha=0.2).plant
-    x, _, _, _, status, t, *_ = kernel.advance(plant, 0.1, 3.0, 0.2, 0.0, 0.0, 1.0, None)
+    x, _, _, _, status, t, *_ = kernel.advance(plant, kernel.State(0.1, 3.0), kernel.Drive(0.2, 0.0, 0.0), 1.0, None)
     assert status == kernel.CONTACT_LOST
     assert x == pytest.approx(math.sqrt(0.144), abs=1e-12)
     assert 0.1 < t < 0.12  # 0.28 to go, a little slower than 3
-    start = kernel.advance(plant, 0.5, 0.0, 0.2, 0.0, 0.0, 1.0, None)
+    start = kernel.advance(plant, kernel.State(0.5, 0.0), kernel.Drive(0.2, 0.0, 0.0), 1.0, None)
     assert (start[4], start[5]) == (kernel.CONTACT_LOST, 0.0)
 
 
@@ -143,17 +154,23 @@ def test_a_dip_to_the_surface_within_one_step_is_not_missed():
     # On the linear belt a_rel = .18 - x at v_rel = 0: from a little before, v_rel rises by lead^2/.4 and falls again.
     for lead in (0.003, 0.004, 0.008, 0.012):
         events = np.empty((8, 4))
-        _, v, belt, _, _, _, n, *_ = kernel.advance(LINEAR, 0.18 - lead, 0.2 - 1e-5, 0.2, 0.0, 0.0, 0.1, events)
+        _, v, belt, _, _, _, n, *_ = kernel.advance(
+            LINEAR, kernel.State(0.18 - lead, 0.2 - 1e-5), kernel.Drive(0.2, 0.0, 0.0), 0.1, events
+        )
         assert events[:n, 1].tolist() == [kernel.RESTICK, kernel.BREAKAWAY]
         assert v < belt
-    *_, n, _, _, _, _, _ = kernel.advance(LINEAR, 0.18 - 0.001, 0.2 - 1e-5, 0.2, 0.0, 0.0, 0.1, None)
+    *_, n, _, _, _, _, _ = kernel.advance(
+        LINEAR, kernel.State(0.18 - 0.001, 0.2 - 1e-5), kernel.Drive(0.2, 0.0, 0.0), 0.1, None
+    )
     assert n == 0
 
 
 def test_no_event_is_invented_right_after_breakaway():
     for fraction in (1e-12, 1e-9, 1e-6, 1e-3):
         events = np.empty((64, 4))
-        _, v, belt, mode, status, _, n, *_ = kernel.advance(LINEAR, 0.18, 0.2, 0.2, 0.0, 0.0, fraction, events)
+        _, v, belt, mode, status, _, n, *_ = kernel.advance(
+            LINEAR, kernel.State(0.18, 0.2), kernel.Drive(0.2, 0.0, 0.0), fraction, events
+        )
         assert status == kernel.OK
         assert n <= 1
         assert v <= belt
@@ -161,7 +178,9 @@ def test_no_event_is_invented_right_after_breakaway():
 
 def test_integrals_over_an_interval_are_those_of_its_motion():
     # stuck on a steady belt: v^2 = v_b^2, and the contact force does what spring and damper undo
-    *_, int_v2, stick_time, int_fv, x_min, x_max = kernel.advance(LINEAR, 0.0, 0.2, 0.2, 0.0, 0.05, 0.5, None)
+    *_, int_v2, stick_time, int_fv, x_min, x_max = kernel.advance(
+        LINEAR, kernel.State(0.0, 0.2), kernel.Drive(0.2, 0.0, 0.05), 0.5, None
+    )
     assert int_v2 == pytest.approx(0.02, rel=1e-14)
     assert stick_time == 0.5
     assert int_fv == pytest.approx(-0.05 * 0.1 + 0.1 * 0.02 + 0.5 * 0.1**2, rel=1e-13)
@@ -171,7 +190,7 @@ def test_integrals_over_an_interval_are_those_of_its_motion():
 def test_turning_points_inside_an_interval_are_found():
     # almost free oscillation: x = cos t from (1, 0) has its minimum -1 at t = pi
     plant = OscillatorParameters(geometry="linear", beta=0.0, mu_s=0.0, mu_m=0.0).plant
-    *_, x_min, x_max = kernel.advance(plant, 1.0, 0.0, 5.0, 0.0, 0.0, 4.0, None)
+    *_, x_min, x_max = kernel.advance(plant, kernel.State(1.0, 0.0), kernel.Drive(5.0, 0.0, 0.0), 4.0, None)
     assert (x_min, x_max) == pytest.approx((-1.0, 1.0), abs=1e-10)
 
 
@@ -202,6 +221,7 @@ def test_normal_numbers_have_mean_zero_and_variance_one():
 
 SCENARIO = """
 import math, struct, sys
+import numpy as np
 from sd_friction_env import kernel
 from sd_friction_env.parameters import RANGES, STATE_LIMIT, OscillatorParameters as P
 out = bytearray()
@@ -211,11 +231,14 @@ for i, geometry in enumerate(("exact", "cubic", "linear")):
     for n in range(150):
         u = 0.05 * (2.0 * kernel.random_uniform(11, i, n, 0) - 1.0)
         a = 0.4 * (2.0 * kernel.random_uniform(11, i, n, 1) - 1.0)
-        r = kernel.advance(p.plant, x, v, belt, a, u, 0.1, None)
+        r = kernel.advance(p.plant, kernel.State(x, v), kernel.Drive(belt, a, u), 0.1, None)
         x, v, belt = r[:3]
         out += struct.pack("<7d", *r[:3], *r[7:10], r[11])
-    r = kernel.control_interval(*p.plant, 1, 0.5, 0.5, 0.2, 0.1, 0.1, 0.5, 0.4, 0.1, 0.21, -0.3)
-    out += struct.pack("<19d", *map(float, r))
+    actuator = kernel.Actuator(1, 0.5, 0.5, 0.2, 0.1, 0.1, 0.5)
+    x, v, v_belt, action = (np.array([value]) for value in (0.4, 0.1, 0.21, -0.3))
+    ends = np.empty((4, 1))
+    kernel.control_intervals(p.plant, actuator, x, v, v_belt, action, *ends)
+    out += ends.tobytes()
     out += struct.pack("<d", kernel.random_normal(1, 2, 3, 4))
 sys.stdout.write(out.hex())
 """
@@ -250,32 +273,36 @@ def test_a_step_whose_stages_overflow_is_refused_and_not_taken_for_exact(case):
 
     known = solve_ivp(slip, (0.0, 0.1), (x, v), method="Radau", rtol=1e-10, atol=1e-13).y[:, -1]
     assert known[1] < p.belt_speed  # it slips all the way
-    end = kernel.advance(p.plant, x, v, p.belt_speed, 0.0, 0.0, 0.1, None)
+    end = kernel.advance(p.plant, kernel.State(x, v), kernel.Drive(p.belt_speed, 0.0, 0.0), 0.1, None)
     assert end[4] == kernel.OK
     assert end[:2] == pytest.approx(known, abs=1e-7)
 
 
 def test_an_error_estimate_that_overflows_is_infinite():
     plant = OscillatorParameters(v_m=0.05, mu_s=0.5).plant
-    for h in np.geomspace(1e-3, 0.2, 400):
-        x, v, _, _, error, _, _ = kernel.slip_step(plant, -1, 0.734, -0.158, 0.2, 0.0, 0.0, h)
+    for h in np.geomspace(1e-3, 0.2, 400).tolist():
+        x, v, _, _, error, _, _ = kernel.slip_step(
+            plant, -1, kernel.State(0.734, -0.158), kernel.Drive(0.2, 0.0, 0.0), h
+        )
         assert error > kernel.TOLERANCE * h or (abs(x) < 1.0 and abs(v) < 0.2)
 
 
 def test_a_motion_too_stiff_for_the_error_rule_is_given_up_within_a_bounded_number_of_steps():
     # Friction drags the mass along with a belt of acceleration 1e6, and rises 1e6 times as fast as v there.
     plant = OscillatorParameters(v_m=0.01).plant
-    start = (plant, -1, 0.0, 0.1, 0.2, 1e6, 0.0, 1.0, False)
-    t, *_, event, _, _, _, _, left = kernel.slip_until_event(*start, 500.0, kernel.NOTHING_KNOWN)
-    assert event == kernel.STEP_SIZE_UNDERFLOW
-    assert -1.0 <= left < 0.0
-    assert 0.0 < t < 0.1
-    end = kernel.advance(plant, 0.0, 0.1, 0.2, 1e6, 0.0, 1.0, None)
+    state, drive = kernel.State(0.0, 0.1), kernel.Drive(0.2, 1e6, 0.0)
+    leg = kernel.slip_until_event(plant, -1, state, drive, 1.0, kernel.TO_EVENT, 500.0, kernel.UNTRIED)
+    assert leg.event == kernel.STEP_SIZE_UNDERFLOW
+    assert -1.0 <= leg.trials < 0.0
+    assert 0.0 < leg.time < 0.1
+    end = kernel.advance(plant, kernel.State(0.0, 0.1), kernel.Drive(0.2, 1e6, 0.0), 1.0, None)
     assert end[4] == kernel.STEP_LIMIT
-    assert t < end[5] < 1.0
-    t, *_, event, _, _, _, _, left = kernel.slip_until_event(*start[:5], 0.0, *start[6:], 500.0, kernel.NOTHING_KNOWN)
-    assert event != kernel.STEP_SIZE_UNDERFLOW
-    assert left > 0.0
+    assert leg.time < end.time < 1.0
+    leg = kernel.slip_until_event(
+        plant, -1, state, drive._replace(a_belt=0.0), 1.0, kernel.TO_EVENT, 500.0, kernel.UNTRIED
+    )
+    assert leg.event != kernel.STEP_SIZE_UNDERFLOW
+    assert leg.trials > 0.0
 
 
 # Environments by themselves and in a batch: many of them slip, stick, meet events, lose contact and begin anew.
@@ -331,6 +358,8 @@ def test_a_step_does_not_leap_over_a_sharp_friction_layer():
     p = OscillatorParameters(
         geometry="duffing", friction="hyperbolic", g1=0.001, delta=801.61730657889, belt_speed=10.0
     )
-    end = kernel.advance(p.plant, -0.8229819684921935, 10.0, 10.0, 0.0, -0.14713030823428672, 0.1, None)
+    end = kernel.advance(
+        p.plant, kernel.State(-0.8229819684921935, 10.0), kernel.Drive(10.0, 0.0, -0.14713030823428672), 0.1, None
+    )
     assert end[4] == kernel.OK
     assert end[1] == pytest.approx(9.929318769, abs=1e-9)

@@ -59,7 +59,10 @@ def test_a_value_of_the_wrong_type_is_refused(value):
 def test_mu_m_above_mu_s_and_unknown_geometry_and_unknown_name_are_refused():
     with pytest.raises(ValueError, match=r"mu_m must not exceed mu_s = 0\.1, got 0\.2"):
         OscillatorParameters(mu_s=0.1, mu_m=0.2)
-    with pytest.raises(ValueError, match="geometry must be one of 'exact', 'cubic', 'linear', 'duffing', got 'round'"):
+    with pytest.raises(
+        ValueError,
+        match=r"geometry must be one of 'exact', 'cubic', 'linear', 'duffing', or a law .* @spring_law, got 'round'",
+    ):
         OscillatorParameters(geometry="round")
     with pytest.raises(ValueError, match="unknown parameter 'alfa'"):
         OscillatorParameters().replace(alfa=0.5)
@@ -90,7 +93,8 @@ def test_a_rig_in_si_units_becomes_dimensionless_and_leads_back():
     friction = -OscillatorParameters.friction_coefficient(p, v - p.belt_speed)
     normal = RIG["M"] * RIG["g"] - RIG["K"] * RIG["H"] * (1 - RIG["L"] / length)
     acceleration = (friction * normal - RIG["K"] * X * (1 - RIG["L"] / length) - RIG["C"] * V) / RIG["M"]
-    ours, _ = kernel.slip_forces(p.plant, kernel.SLIP_BACKWARD, x, v, p.belt_speed, 0.0)
+    steady = kernel.Drive(p.belt_speed, 0.0, 0.0)
+    ours = kernel.slip_acceleration(p.plant, kernel.SLIP_BACKWARD, kernel.State(x, v), steady)
     assert ours * p.length_scale / p.time_scale**2 == pytest.approx(acceleration, rel=1e-12)
     assert normal == pytest.approx(p.normal_force(x) * p.force_scale, rel=1e-12)
 

@@ -106,7 +106,9 @@ def backward_slip(parameters: OscillatorParameters) -> Flow:
     plant, v_belt = parameters.plant, parameters.belt_speed
 
     def flow(x: float, v: float) -> State:
-        return v, kernel.slip_forces(plant, kernel.SLIP_BACKWARD, x, v, v_belt, 0.0)[0]
+        return v, kernel.slip_acceleration(
+            plant, kernel.SLIP_BACKWARD, kernel.State(x, v), kernel.Drive(v_belt, 0.0, 0.0)
+        )
 
     return flow
 

@@ -46,7 +46,7 @@ def intervals(parameters, state, drive, h=0.1):
     belt = parameters.belt_speed
     for u, a_belt in drive:
         events = np.empty((kernel.MAX_EVENTS, 4))
-        out = kernel.advance(parameters.plant, x, v, belt, a_belt, u, h, events)
+        out = kernel.advance(parameters.plant, kernel.State(x, v), kernel.Drive(belt, a_belt, u), h, events)
         yield (x, v, belt, a_belt, u), out, events[: out[6]]
         if out[4] != kernel.OK:
             return
@@ -66,13 +66,14 @@ def test_the_automaton_keeps_its_rules_on_every_step(parameters, state, drive):
         assert 0.0 <= stick_time <= t + 1e-12
         assert np.all(np.diff(events[:, 0]) >= 0.0)
         if mode == kernel.STICK:
-            load, limit = kernel.stick_load(plant, x, belt, a_belt, u)
+            load = kernel.stick_load(plant, x, kernel.Drive(belt, a_belt, u))
+            limit = kernel.stick_limit(plant, kernel.SLIP_BACKWARD, x)
             assert abs(load) <= limit * (1.0 + 1e-9) + 1e-12, "friction outside its cone in stick"
             assert v == belt, "creep"
         else:
             assert mode * (v - belt) >= 0.0, "the sign of v_rel disagrees with the mode"
         if status == kernel.OK:
-            assert kernel.spring(plant, x)[1] > 0.0
+            assert kernel.normal_force(plant, x) > 0.0
 
 
 @SETTINGS
@@ -91,12 +92,16 @@ def test_energy_balances_over_every_interval(parameters, state, drive):
 @given(oscillators(), states, between(-0.3, 0.3))
 def test_one_interval_is_the_same_as_its_two_halves(parameters, state, u):
     x, v = state[0], parameters.belt_speed if state[1] is None else state[1]
-    whole = kernel.advance(parameters.plant, x, v, parameters.belt_speed, 0.0, u, 0.2, None)
-    half = kernel.advance(parameters.plant, x, v, parameters.belt_speed, 0.0, u, 0.1, None)
+    whole = kernel.advance(parameters.plant, kernel.State(x, v), kernel.Drive(parameters.belt_speed, 0.0, u), 0.2, None)
+    half = kernel.advance(parameters.plant, kernel.State(x, v), kernel.Drive(parameters.belt_speed, 0.0, u), 0.1, None)
     assume(whole[4] == kernel.OK)
-    second = kernel.advance(parameters.plant, half[0], half[1], parameters.belt_speed, 0.0, u, 0.1, None)
+    second = kernel.advance(
+        parameters.plant, kernel.State(half[0], half[1]), kernel.Drive(parameters.belt_speed, 0.0, u), 0.1, None
+    )
     # A place where the flow itself tears starts apart (a saddle, a graze) is no fault of the step: look for it.
-    apart = kernel.advance(parameters.plant, x + 1e-7, v, parameters.belt_speed, 0.0, u, 0.2, None)
+    apart = kernel.advance(
+        parameters.plant, kernel.State(x + 1e-7, v), kernel.Drive(parameters.belt_speed, 0.0, u), 0.2, None
+    )
     assume(abs(apart[0] - whole[0]) < 1e-5 and abs(apart[1] - whole[1]) < 1e-5)
     assert second[0] == pytest.approx(whole[0], abs=1e-8 * max(1.0, abs(v)))
     assert second[1] == pytest.approx(whole[1], abs=1e-7 * max(1.0, abs(v)))

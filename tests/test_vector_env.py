@@ -503,7 +503,9 @@ def test_a_picture_shows_the_mode_that_the_step_told(monkeypatch):
         assert envs.call_at([1], "render") == [None]
         state = envs.get_states()[1]
         told += [int(info["mode"][1])] * 2
-        undriven += [kernel.mode_of(state.parameters.plant, state.x, state.v, state.v_belt, 0.0, 0.0)] * 2
+        undriven += [
+            kernel.mode_of(state.parameters.plant, kernel.State(state.x, state.v), kernel.Drive(state.v_belt, 0.0, 0.0))
+        ] * 2
     assert [scene.mode for scene in shown] == told
     assert told != undriven
     with pytest.raises(ValueError, match=r"environment 0 is not drawn: render_envs names those that are, \[1\]"):
@@ -658,7 +660,12 @@ def unplaceable(monkeypatch):
     def refuse(*arguments):
         raise OrbitError("no start")
 
-    monkeypatch.setattr(kernel, "own_cycle_starts", lambda state, integers, which, phases, beyond: np.ones(len(which)))
+    steppers = kernel.steppers
+
+    def without_starts(plant):
+        return steppers(plant)._replace(own_cycle_starts=lambda state, counts, which, *_: np.ones(len(which)))
+
+    monkeypatch.setattr(kernel, "steppers", without_starts)
     monkeypatch.setattr(Task, "start_state", refuse)
 
 

@@ -12,8 +12,9 @@ NOMINAL = OscillatorParameters()
 LAW_FIELDS = {
     "stribeck": ("mu_m", "v_m"),
     "coulomb": ("mu_k",),
-    "hyperbolic": ("delta",),
+    "hyperbolic": ("delta", "mu_v"),
     "exponential": ("mu_k", "v_0", "mu_v"),
+    "gaussian": ("mu_k", "v_0", "mu_v"),
 }
 SPRING_FIELDS: dict[str, tuple[str, ...]] = {
     "exact": ("alpha",),
@@ -34,6 +35,7 @@ _HARD = {
     "mu_v": 1,
     "beta": 1,
 }
+_DRAWN = RANGES | {"kappa": (0.0, 10.0), "linear_stiffness": (1.0, 1.0)}  # a softening spring lets a mass escape
 _SCALES = ("time_scale", "length_scale", "force_scale")
 
 
@@ -85,7 +87,7 @@ def values(rng: np.random.Generator, excited: float = 0.3, unused: bool = False,
     geometry, friction = str(rng.choice(GEOMETRIES)), str(rng.choice(FRICTIONS))
     used = fields_used(geometry, friction)
     drawn: dict[str, Any] = {"geometry": geometry, "friction": friction}
-    for name, (low, high) in RANGES.items():
+    for name, (low, high) in _DRAWN.items():
         if name in used or (unused and not name.startswith(EXCITATIONS)):
             drawn[name] = number(rng, low, high)
             if name in used and rng.random() < 0.3:  # plants of which most is ordinary have their own faults
@@ -135,7 +137,7 @@ def start(rng: np.random.Generator, parameters: OscillatorParameters, interval: 
     x = signed(rng, STATE_LIMIT if rng.random() < 0.5 else 1.5)
     v = signed(rng, STATE_LIMIT if rng.random() < 0.5 else 1.0)
     if rng.random() < 0.25:
-        v = float(kernel.room_v(kernel.later(parameters.plant, time), v_belt))
+        v = float(kernel.at_time(parameters.plant, time).excitation.lab_velocity(v_belt))
     if rng.random() < 0.05:
         x = 0.0
     return Start(x, v, v_belt, a_belt, u, time)

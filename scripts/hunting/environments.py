@@ -294,9 +294,11 @@ def info_trial(seed: int, index: int) -> Mapping[str, float]:
     for step, action in enumerate(made.actions[:, 0]):
         before, state = info, env.get_state()
         _, _, terminated, truncated, info = env.step(np.array([action]))
-        plant = kernel.later(p.plant, step * interval)
+        plant = kernel.at_time(p.plant, step * interval)
         acting = (info["belt_acceleration"], info["force"])
-        wanted = kernel.advance(plant, state.x, state.v, state.v_belt, *acting, interval, None)
+        wanted = kernel.advance(
+            plant, kernel.State(state.x, state.v), kernel.Drive(state.v_belt, *acting), interval, None
+        )
         try:
             check_info(p, before, info, terminated, truncated, step * interval + wanted[5], wanted[2])
         except Failure as found:

@@ -9,6 +9,7 @@ budget of integration steps ends before the extremes do not change any more; suc
 """
 
 import argparse
+import functools
 import math
 import time
 from collections import Counter
@@ -98,7 +99,7 @@ def follow(p: OscillatorParameters, x: float, v: float, found: Basins, label: in
             rate = stiffest(p, x, v)
             piece = min(left, 2e4 / rate)
             x, v, _, mode, status, t, _, _, stick_time, _, x_min, x_max = kernel.advance(
-                plant, x, v, belt, 0.0, 0.0, piece, None
+                plant, kernel.State(x, v), kernel.Drive(belt, 0.0, 0.0), piece, None
             )
             low, high = min(low, x_min), max(high, x_max)
             left = 0.0 if piece == left and status == kernel.OK else left - t
@@ -132,6 +133,12 @@ def follow(p: OscillatorParameters, x: float, v: float, found: Basins, label: in
         duration *= 2.0
 
 
+@functools.cache
+def compile_for(geometry: str, friction: str, alpha: float) -> None:
+    """Compile what basins of plants with these laws need: it is not what is timed."""
+    basins(OscillatorParameters(geometry=geometry, friction=friction, alpha=alpha), np.zeros(1), np.zeros(1))
+
+
 def check_basins(seed: int, starts: int) -> tuple[int, int, list[dict[str, Any]]]:
     """Return how many starts were tried, how many labels a direct run confirmed, and the others, each with its seed."""
     held, rest = 0, []
@@ -140,6 +147,7 @@ def check_basins(seed: int, starts: int) -> tuple[int, int, list[dict[str, Any]]
         p = draw_plant(rng)
         count = min(STARTS_OF_A_PLANT, starts - plant_number * STARTS_OF_A_PLANT)
         places = draw_starts(rng, p, STARTS_OF_A_PLANT)[:count]
+        compile_for(p.geometry, p.friction, 0.0 if p.discontinuous else 0.8)
         begin = time.perf_counter()
         found = basins(p, np.clip(places[:, 0], -10, 10), np.clip(places[:, 1], -10, 10))
         lasted = time.perf_counter() - begin

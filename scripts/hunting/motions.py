@@ -30,12 +30,14 @@ def distance_left(cycle: LimitCycle, moved: float) -> float:
         period = 2.0 * math.pi / max(abs(slowest.imag), 0.1)
         time = max(LAPS * period, -3.0 / slowest.real if slowest.real else 0.0)
     x, v = cycle.x_max + moved, 0.0
-    out = kernel.advance(p.plant, x, v, p.belt_speed, 0.0, 0.0, time, None)
+    out = kernel.advance(p.plant, kernel.State(x, v), kernel.Drive(p.belt_speed, 0.0, 0.0), time, None)
     if out[4] in (kernel.STEP_LIMIT, kernel.EVENT_LIMIT):
         raise SetAside(kernel.STATUS_NAMES[out[4]])
     if out[4] != kernel.OK:
         return math.inf
-    out = kernel.advance(p.plant, out[0], out[1], p.belt_speed, 0.0, 0.0, 1.25 * period, None)
+    out = kernel.advance(
+        p.plant, kernel.State(out[0], out[1]), kernel.Drive(p.belt_speed, 0.0, 0.0), 1.25 * period, None
+    )
     return float(max(abs(out[11] - cycle.x_max), abs(out[10] - cycle.x_min)) / abs(moved))
 
 
@@ -64,7 +66,11 @@ def attractor_trial(seed: int, index: int) -> Mapping[str, float] | None:
                     raise Failure("attracts nothing", words)
             elif cycle.kind == "stick-slip":
                 end = kernel.advance(
-                    p.plant, cycle.x_phase0, cycle.v_phase0, p.belt_speed, 0.0, 0.0, cycle.period, None
+                    p.plant,
+                    kernel.State(cycle.x_phase0, cycle.v_phase0),
+                    kernel.Drive(p.belt_speed, 0.0, 0.0),
+                    cycle.period,
+                    None,
                 )
                 if end[4] == kernel.OK and abs(end[0] - cycle.x_phase0) > 1e-7 * max(1.0, abs(cycle.x_phase0)):
                     words = f"a stick-slip cycle from x = {cycle.x_phase0!r} is at {end[0]!r} after its period"

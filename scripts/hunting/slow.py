@@ -31,11 +31,11 @@ def described(seed: int, index: int) -> str:
 def trial(seed: int, index: int) -> Mapping[str, float]:
     """Measure one control interval."""
     p, at, interval = drawn(seed, index)
-    plant = kernel.later(p.plant, at.time)
+    plant = kernel.at_time(p.plant, at.time)
     least = np.inf
     for _ in range(_REPEATS):
         begun = time.thread_time()
-        kernel.advance(plant, *at[:5], interval, None)
+        kernel.advance(plant, kernel.State(*at[:2]), kernel.Drive(*at[2:5]), interval, None)
         least = min(least, time.thread_time() - begun)
         if least <= LONGEST:
             return {"slowest control interval, s": least}

@@ -43,7 +43,9 @@ def in_pieces(plant, x, v, v_belt, a_belt, u, duration, moved, dx, dv, rows):  #
             x = x + dx
             v = v + dv
         begin = i * length
-        out = kernel.advance(kernel.later(plant, begin), x, v, belt, a_belt, u, length, None)
+        out = kernel.advance(
+            kernel.at_time(plant, begin), kernel.State(x, v), kernel.Drive(belt, a_belt, u), length, None
+        )
         x_end, v_end, b, mode, status, t, n, v2, stuck, fv, low, high = out
         rows[i] = np.array([x_end, v_end, b, mode, status, t, n, v2, stuck, fv, low, high])
         if status != kernel.OK:
@@ -62,7 +64,7 @@ def at_nodes(plant, x, v, v_belt, a_belt, u, duration, piece, finer, nodes, weig
     Return how many; the rest has no room.
     """
     events = np.empty((kernel.MAX_EVENTS, 4))
-    out = kernel.advance(plant, x, v, v_belt, a_belt, u, duration, events)
+    out = kernel.advance(plant, kernel.State(x, v), kernel.Drive(v_belt, a_belt, u), duration, events)
     n_events = out[6]
     t = 0.0
     n = 0
@@ -76,13 +78,17 @@ def at_nodes(plant, x, v, v_belt, a_belt, u, duration, piece, finer, nodes, weig
                 if n == len(rows):
                     return n
                 dt = nodes[j] * length
-                out = kernel.advance(kernel.later(plant, t), x, v, belt, a_belt, u, dt, None)
+                out = kernel.advance(
+                    kernel.at_time(plant, t), kernel.State(x, v), kernel.Drive(belt, a_belt, u), dt, None
+                )
                 rows[n, 0] = t + dt
                 rows[n, 1] = out[0]
                 rows[n, 2] = out[1]
                 rows[n, 3] = weights[j] * length
                 n += 1
-            out = kernel.advance(kernel.later(plant, t), x, v, belt, a_belt, u, length, None)
+            out = kernel.advance(
+                kernel.at_time(plant, t), kernel.State(x, v), kernel.Drive(belt, a_belt, u), length, None
+            )
             x = out[0]
             v = out[1]
             belt = out[2]  # as it is returned: a stuck mass has this speed to the bit
@@ -100,7 +106,7 @@ def run(
 ) -> FloatArray:
     """Return what each piece gave, (n, 12)."""
     rows = np.empty((pieces, 12))
-    plant = kernel.later(p.plant, at.time)
+    plant = kernel.at_time(p.plant, at.time)
     i, dx, dv = moved
     done = in_pieces(plant, at.x, at.v, at.v_belt, at.a_belt, at.u, duration, i, float(dx), float(dv), rows)
     return rows[:done]
@@ -115,7 +121,7 @@ def excitation_work(p: OscillatorParameters, at: Start, duration: float, size: f
     """
     acting = [kind for kind in ("force", "ripple", "stiffness") if getattr(p, f"{kind}_amplitude")]
     piece = min(0.05, *(0.5 / getattr(p, f"{kind}_frequency") for kind in acting))
-    plant = kernel.later(p.plant, at.time)
+    plant = kernel.at_time(p.plant, at.time)
     rows = np.empty((10_000, 4))
     before = math.nan
     for halvings in range(11):

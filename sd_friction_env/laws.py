@@ -1,0 +1,263 @@
+"""Laws of one's own: springs and friction laws as NamedTuple classes, friction tables, and checks of their derivatives.
+
+A law is a NamedTuple class with the methods that :func:`friction_law` or :func:`spring_law` name. An instance of it is
+given to :class:`OscillatorParameters` as ``friction`` or ``geometry``, and works wherever a built-in law does.
+"""
+
+import csv
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator
+
+from sd_friction_env.kernel import (
+    FRICTION,
+    SPRING,
+    Asymmetric,
+    Coulomb,
+    Exponential,
+    Gaussian,
+    Hyperbolic,
+    Stribeck,
+    Tabulated,
+    friction_law,
+    spring_law,
+)
+
+__all__ = [
+    "Asymmetric",
+    "Coulomb",
+    "Exponential",
+    "Gaussian",
+    "Hyperbolic",
+    "Stribeck",
+    "Tabulated",
+    "check_friction_law",
+    "check_spring_law",
+    "friction_law",
+    "friction_table",
+    "spring_law",
+    "tabulated_friction",
+]
+
+_RELATIVE_ERROR = 1e-4  # of a derivative against a difference
+_SPEEDS = np.geomspace(1e-2, 5.0, 12).tolist()
+_PLACES = np.linspace(-2.03, 1.97, 12).tolist()
+_FRICTION_CHAIN = ("coefficient", "slope", "curvature", "third_derivative")
+_SPRING_CHAINS = (
+    ("potential", "restoring_force", "restoring_slope", "restoring_curvature"),
+    ("normal_force", "normal_slope", "normal_curvature"),
+)
+_KERNEL = FRICTION["coefficient"].__module__.rpartition(".")[0]
+
+
+# A friction curve that was measured -----------------------------------------------------------------------------------
+
+
+def tabulated_friction(speeds: ArrayLike, coefficients: ArrayLike) -> Tabulated:
+    """Return the friction law that interpolates a measured curve.
+
+    Between the points it is the monotone cubic interpolation of Fritsch and Carlson (1980), continuous with its slope;
+    beyond the last it is level. Stick holds up to the first coefficient. For a curve that differs by direction, make
+    ``Asymmetric(backward=..., forward=...)`` of two.
+
+    Args:
+        speeds: of the mass relative to the belt, without sign, (n,), ascending from 0; n >= 3.
+        coefficients: of friction, (n,), none below 0.
+
+    Raises:
+        TypeError: if they are not numbers. ValueError: if they are not as said, naming the place.
+    """
+    w, mu = _column("speeds", speeds), _column("coefficients", coefficients)
+    if len(w) != len(mu):
+        raise ValueError(f"speeds and coefficients must have one length, got {len(w)} and {len(mu)}")
+    if len(w) < 3:
+        raise ValueError(f"speeds must have at least 3 points, got {len(w)}")
+    if w[0] != 0.0:
+        raise ValueError(f"speeds must begin with 0, the coefficient of stick, got {w[0]!r}")
+    falls = np.flatnonzero(np.diff(w) <= 0.0)
+    if falls.size:
+        i = int(falls[0]) + 1
+        raise ValueError(f"speeds must ascend, got {w[i].item()!r} after {w[i - 1].item()!r} at point {i}")
+    below = np.flatnonzero(mu < 0.0)
+    if below.size:
+        raise ValueError(f"coefficients must not be below 0, got {mu[below[0]].item()!r} at point {int(below[0])}")
+    slopes = np.asarray(PchipInterpolator(w, mu).derivative()(w), np.float64)
+    slopes[-1] = 0.0  # level from there on
+    return Tabulated(w, mu, slopes)
+
+
+def friction_table(path: str | Path) -> Tabulated:
+    """Return :func:`tabulated_friction` of a CSV file: a speed and a coefficient in each line.
+
+    Empty lines and those that begin with ``#`` are skipped, and one line of names at the top.
+
+    Raises:
+        OSError: if the file cannot be read. ValueError: if a line is not two numbers, or the curve is no friction law.
+    """
+    rows: list[tuple[float, float]] = []
+    with Path(path).open(newline="", encoding="utf-8") as file:
+        for number, line in enumerate(csv.reader(file), 1):
+            if not line or line[0].lstrip().startswith("#"):
+                continue
+            try:
+                speed, coefficient = (float(cell) for cell in line)
+            except ValueError:
+                if not rows and not any(cell.strip()[:1].isdigit() for cell in line):
+                    continue  # names
+                raise ValueError(
+                    f"line {number} of {str(path)!r} must be a speed and a coefficient, got {line}"
+                ) from None
+            rows.append((speed, coefficient))
+    table = np.array(rows, np.float64).reshape(-1, 2)
+    try:
+        return tabulated_friction(table[:, 0], table[:, 1])
+    except ValueError as fault:
+        raise ValueError(f"{str(path)!r} holds no friction curve: {fault}") from None
+
+
+def _column(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    try:
+        array = np.array(values, np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be numbers in an array of shape (n,), got {values!r}") from None
+    if array.ndim != 1:
+        raise ValueError(f"{name} must be an array of shape (n,), got shape {array.shape}")
+    bad = np.flatnonzero(~np.isfinite(array))
+    if bad.size:
+        raise ValueError(f"{name} must be finite, got {array[bad[0]].item()!r} at point {int(bad[0])}")
+    return array
+
+
+# Checks ---------------------------------------------------------------------------------------------------------------
+
+
+def checked_friction_law(name: str, value: Any, names: tuple[str, ...]) -> Any:
+    """Return ``value`` if it is one of ``names`` or a friction law whose derivatives are right.
+
+    Raises:
+        ValueError: if it is neither, or a number of the law is not finite.
+    """
+    return _checked(name, value, names, FRICTION, check_friction_law, "friction_law")
+
+
+def checked_spring_law(name: str, value: Any, names: tuple[str, ...]) -> Any:
+    """Return ``value`` if it is one of ``names`` or a spring whose derivatives are right.
+
+    Raises:
+        ValueError: if it is neither, or a number of the law is not finite.
+    """
+    return _checked(name, value, names, SPRING, check_spring_law, "spring_law")
+
+
+def _checked(
+    name: str, value: Any, names: tuple[str, ...], protocol: Any, check: Callable[[Any], None], decorator: str
+) -> Any:
+    if isinstance(value, str) and value in names:
+        return value
+    law = type(value)
+    if not isinstance(value, tuple) or not all(callable(getattr(law, method, None)) for method in protocol):
+        text = repr(value)
+        text = text if len(text) <= 300 else f"{text[:100]}... ({len(text)} characters)"
+        choices = ", ".join(map(repr, names))
+        raise ValueError(f"{name} must be one of {choices}, or a law declared with @{decorator}, got {text}")
+    check(value)
+    return value
+
+
+@functools.lru_cache(maxsize=1024)
+def check_friction_law(law: Any) -> None:
+    """Check that a friction law is finite, no stronger in slip than in stick at v_rel = 0, and compare its derivatives.
+
+    They are compared with differences, in both modes, at speeds from 0.01 to 5; those of built-in laws are not.
+
+    Raises:
+        ValueError: names the law, the method, the place, the value and what it should be.
+    """
+    _check_numbers(law)
+    for mode in (-1, 1):
+        limit, slip = law.breakaway_coefficient(mode), mode * law.coefficient(mode, 0.0)
+        if not 0.0 <= limit < math.inf:
+            raise ValueError(
+                f"{_name(law)}.breakaway_coefficient({mode}) must be finite and not below 0, got {limit!r}"
+            )
+        if not slip <= limit * (1.0 + 1e-12):
+            raise ValueError(
+                f"{_name(law)}.coefficient({mode}, 0.0) must not exceed breakaway_coefficient({mode}) = {limit!r} in "
+                f"size, got {slip!r}: what slips could not come to rest"
+            )
+    for part in _own_parts(law):
+        for mode in (-1, 1):
+            for speed in _SPEEDS:
+                _check_chain(part, _FRICTION_CHAIN, functools.partial(_friction_value, part, mode), mode * speed)
+
+
+@functools.lru_cache(maxsize=1024)
+def check_spring_law(law: Any) -> None:
+    """Check that a spring is finite, and compare its derivatives with differences, at places within 2 of x = 0.
+
+    Raises:
+        ValueError: names the law, the method, the place, the value and what it should be.
+    """
+    _check_numbers(law)
+    for part in _own_parts(law):
+        for place in _PLACES:
+            for chain in _SPRING_CHAINS:
+                _check_chain(part, chain, functools.partial(_spring_value, part), place)
+
+
+def _name(law: Any) -> str:
+    return type(law).__name__
+
+
+def _check_numbers(law: Any) -> None:
+    for name, value in zip(law._fields, law, strict=True):
+        if isinstance(value, tuple):
+            _check_numbers(value)
+        elif not isinstance(value, np.ndarray) and not (isinstance(value, int | float) and math.isfinite(value)):
+            raise ValueError(f"{_name(law)}.{name} must be a finite number, got {value!r}")
+
+
+def _own_parts(law: Any) -> Iterator[Any]:
+    """Yield the law, or the laws in it, that are not built in."""
+    if not type(law).__module__.startswith(_KERNEL):
+        yield law
+    else:
+        for part in law:
+            if isinstance(part, tuple):
+                yield from _own_parts(part)
+
+
+def _friction_value(law: Any, mode: int, method: str, v_rel: float) -> float:
+    value: float = getattr(law, method)(mode, v_rel)
+    return value
+
+
+def _spring_value(law: Any, method: str, x: float) -> float:
+    value: float = law.normal_force(1.0, x) if method == "normal_force" else getattr(law, method)(x)
+    return value
+
+
+def _check_chain(law: Any, chain: tuple[str, ...], value: Callable[[str, float], float], at: float) -> None:
+    h = 1e-4 * abs(at)
+    for method in chain:
+        found = value(method, at)
+        if not math.isfinite(found):
+            raise ValueError(f"{_name(law)}.{method} must be finite, got {found!r} at {at:.6g}")
+    for method, derivative in itertools.pairwise(chain):
+        far, near = ((value(method, at + step) - value(method, at - step)) / (2.0 * step) for step in (2.0 * h, h))
+        difference = (4.0 * near - far) / 3.0
+        found = value(derivative, at)
+        # A kink between the points makes the two differences differ, and nothing is said then.
+        allowed = _RELATIVE_ERROR * (abs(difference) + abs(value(method, at))) + abs(near - far) + 1e-7
+        if abs(found - difference) > allowed:
+            raise ValueError(
+                f"{_name(law)}.{derivative} must be the derivative of {method}: at {at:.6g} it is {found:.9g}, a "
+                f"difference gives {difference:.9g}"
+            )

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
-import numba.extending
 import numpy as np
 
 from sd_friction_env.kernel.automaton import follow
@@ -25,93 +24,34 @@ from sd_friction_env.kernel.episodes import (
     point_before,
     unexcited,
 )
-from sd_friction_env.kernel.excitation import Excitation
-from sd_friction_env.kernel.lanes import (
+from sd_friction_env.kernel.excitation import NO_PHASES, Excitation
+from sd_friction_env.kernel.gathering import (
     advance_after_trial,
     advance_lane,
     gather,
-    look_lane,
-    onward_lane,
     queue_breakaway,
     queue_crossing,
     queue_look,
     scatter_finished,
     scatter_onward,
     scatter_stuck,
-    slip_lane,
-    stick_lane,
     write_lane,
 )
+from sd_friction_env.kernel.lanes import look_lane, onward_lane, slip_lane, stick_lane
 from sd_friction_env.kernel.leaves import reader_of, shape_of
+from sd_friction_env.kernel.memory import arrays_in, without_refcount
 from sd_friction_env.kernel.plant import Drive, State, at_time, steady
 from sd_friction_env.kernel.random import random_uniform
 from sd_friction_env.kernel.return_map import (
     REPEATED_BREAKAWAY,
     SETTLING_EXITS,
     SETTLING_LAPS,
-    TRAP_ROW,
     iterate_to_attractor,
     stick_slip_lap,
 )
-from sd_friction_env.kernel.rows import (
-    COUNT_EPISODE,
-    COUNT_KEY,
-    COUNT_ROWS,
-    COUNT_STEPS,
-    FINISHED,
-    LANE_A_BELT,
-    LANE_ACTION,
-    LANE_BELT,
-    LANE_BELT_END,
-    LANE_BELT_SPEED,
-    LANE_CONTACT_LOSS,
-    LANE_CONTROL_POWER,
-    LANE_DONE,
-    LANE_EFFORT,
-    LANE_EVENTS,
-    LANE_FRICTION_POWER,
-    LANE_MEAN_V2,
-    LANE_MODE,
-    LANE_NORMAL,
-    LANE_PLANT,
-    LANE_REWARD,
-    LANE_STATUS,
-    LANE_STICK,
-    LANE_STICK_FRACTION,
-    LANE_TERMINATED,
-    LANE_TIME,
-    LANE_TRUNCATED,
-    LANE_U,
-    LANE_V,
-    LANE_V_END,
-    LANE_V_REL,
-    LANE_VIBRATION,
-    LANE_X,
-    LANE_X_END,
-    LANE_X_MAX,
-    LANE_X_MIN,
-    LANES,
-    LOOK_LANE,
-    LOOK_MODE,
-    ONWARD_EVENTS,
-    ONWARD_OUTCOME,
-    ONWARD_V_END,
-    STATE_BELT,
-    STATE_BELT_SPEED,
-    STATE_PLANT,
-    STATE_V,
-    STATE_X,
-    STRIDE,
-    TASK_CODES,
-    TASK_INTERVAL,
-    TASK_NUMBERS,
-    TASK_ONE_PLANT,
-    TASK_SEES_PHASES,
-    TASK_SENSOR_DELAY,
-    TASK_SENSOR_NOISE,
-    TASK_SHOWS,
-)
+from sd_friction_env.kernel.rows import *
 from sd_friction_env.kernel.slip import UNTRIED
+from sd_friction_env.kernel.traps import TRAP_ROW
 
 
 class Steppers(NamedTuple):
@@ -138,83 +78,6 @@ class Steppers(NamedTuple):
 def _whole(m):
     """Return m rounded up to whole vectors; what is computed in the lanes beyond m is not looked at."""
     return 8 * ((m + 7) // 8)
-
-
-class Memory(NamedTuple):
-    """The arrays that lie in the flat memory of one environment, as a batch of one has them.
-
-    One environment on its own keeps its arrays in a single one, for each that is handed over costs a call more time.
-    """
-
-    task: Any
-    codes: Any
-    counts: Any  # (COUNT_ROWS, 1)
-    state: Any  # (STATE_PLANT, 1)
-    lane: Any  # a lane with a stride of 1
-    past: Any  # (delay + 1 or 0, 2, 1)
-    shown: Any  # (1, p)
-    plant: Any  # its leaves, and more
-    tables: Any
-
-
-@entry
-def memory_size(sensor_delay, shows):
-    """Return how many numbers the memory of an environment has without its plant."""
-    kept = sensor_delay + 1 if sensor_delay > 0 else 0
-    return TASK_NUMBERS + TASK_CODES + COUNT_ROWS + STATE_PLANT + LANE_PLANT + 2 * kept + shows
-
-
-@in_lanes
-def arrays_in(memory, leaves):
-    """Return the arrays in the memory of an environment whose plant has so many leaves."""
-    first = TASK_NUMBERS + TASK_CODES
-    codes = memory[TASK_NUMBERS:first].view(np.int64)
-    counts = memory[first : first + COUNT_ROWS].view(np.int64).reshape((COUNT_ROWS, 1))
-    first += COUNT_ROWS
-    state = memory[first : first + STATE_PLANT].reshape((STATE_PLANT, 1))
-    first += STATE_PLANT
-    lane = memory[first : first + LANE_PLANT]
-    first += LANE_PLANT
-    kept = codes[TASK_SENSOR_DELAY] + 1 if codes[TASK_SENSOR_DELAY] > 0 else 0
-    past = memory[first : first + 2 * kept].reshape((kept, 2, 1))
-    first += 2 * kept
-    shown = memory[first : first + codes[TASK_SHOWS]].reshape((1, codes[TASK_SHOWS]))
-    first += codes[TASK_SHOWS]
-    plant = memory[first:]
-    return Memory(memory[:TASK_NUMBERS], codes, counts, state, lane, past, shown, plant, plant[leaves:])
-
-
-if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-
-    def without_refcount(array):
-        """Return the array."""
-        return array
-
-else:
-
-    @numba.extending.intrinsic
-    def without_refcount(context, array):
-        """Return the array without its count of references, which all threads would have to write to at every slice."""
-
-        def generate(context, builder, signature, arguments):
-            bare = context.make_array(array)(context, builder, arguments[0])
-            bare.meminfo = bare.meminfo.type(None)
-            bare.parent = bare.parent.type(None)
-            return bare._getvalue()
-
-        return array(array), generate
-
-
-@entry
-def fill_plant(work, state):
-    """Put one environment's plant and belt speed, from its column of the state, into all lanes of both work spaces."""
-    half = len(work) // 2
-    for i in range(STRIDE):
-        work[LANE_BELT_SPEED * STRIDE + i] = state[STATE_BELT_SPEED]
-        work[half + LANE_BELT_SPEED * STRIDE + i] = state[STATE_BELT_SPEED]
-        for leaf in range(half // STRIDE - LANE_PLANT):
-            work[(LANE_PLANT + leaf) * STRIDE + i] = state[STATE_PLANT + leaf]
-            work[half + (LANE_PLANT + leaf) * STRIDE + i] = state[STATE_PLANT + leaf]
 
 
 @compiled
@@ -272,7 +135,8 @@ def _steppers_of(shape: Any) -> Steppers:
     def observe_many(task, codes, state, counts, past, shown, tables, observations, which):
         for i in which:
             plant = plant_of(state, counts, i, episode_time(state, counts, i, task[TASK_INTERVAL]), tables)
-            observe_one(task, codes, state, counts, past, shown, plant.excitation.phases(), observations, i)
+            phases = plant.excitation.phases() if codes[TASK_SEES_PHASES] else NO_PHASES
+            observe_one(task, codes, state, counts, past, shown, phases, observations, i)
 
     @entry
     def observe(task, codes, state, counts, past, shown, tables, observations, which):
@@ -285,7 +149,8 @@ def _steppers_of(shape: Any) -> Steppers:
         task, codes, counts, state, _, past, shown, numbers, tables = arrays_in(memory, leaves)
         time = episode_time(state, counts, 0, task[TASK_INTERVAL])
         plant = at_time(read(numbers, 0, 1, 0, tables), time)
-        observe_one(task, codes, state, counts, past, shown, plant.excitation.phases(), observations, 0)
+        phases = plant.excitation.phases() if codes[TASK_SEES_PHASES] else NO_PHASES
+        observe_one(task, codes, state, counts, past, shown, phases, observations, 0)
 
     @entry
     def step_one(memory, observations, action):
@@ -311,7 +176,8 @@ def _steppers_of(shape: Any) -> Steppers:
         if excited:
             time = episode_time(state, counts, 0, interval)
             then = at_time(read(numbers, 0, 1, 0, tables), time).excitation
-        observe_one(task, codes, state, counts, past, shown, then.phases(), observations, 0)
+        phases = then.phases() if codes[TASK_SEES_PHASES] else NO_PHASES
+        observe_one(task, codes, state, counts, past, shown, phases, observations, 0)
         mode = int(w[LANE_MODE])
         v_belt, v_rel = lab_belt(then, mode, state[STATE_V, 0], state[STATE_BELT, 0])
         return (

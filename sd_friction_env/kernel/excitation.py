@@ -10,6 +10,8 @@ from typing import NamedTuple
 from sd_friction_env.kernel.codes import PHASE_ROUNDING, V_REL_ZERO
 from sd_friction_env.kernel.compilation import compiled
 
+NO_PHASES = (0.0,) * 6  # cosines and sines of none
+
 
 class Unexcited(NamedTuple):
     """No excitation: the belt's frame is the lab's."""
@@ -83,7 +85,7 @@ class Unexcited(NamedTuple):
         return 0.0
 
     def phases(self):
-        return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return NO_PHASES
 
 
 class Excitation(NamedTuple):
@@ -115,9 +117,9 @@ class Excitation(NamedTuple):
     def with_clock_at_zero(self):
         if not self.acts():
             return self
-        force_phase = _phase_at(self.force_frequency, self.force_phase, self.time)
-        ripple_phase = _phase_at(self.ripple_frequency, self.ripple_phase, self.time)
-        stiffness_phase = _phase_at(self.stiffness_frequency, self.stiffness_phase, self.time)
+        force_phase = _phase_at(self.force_amplitude, self.force_frequency, self.force_phase, self.time)
+        ripple_phase = _phase_at(self.ripple_amplitude, self.ripple_frequency, self.ripple_phase, self.time)
+        stiffness_phase = _phase_at(self.stiffness_amplitude, self.stiffness_frequency, self.stiffness_phase, self.time)
         return _with_clock(self, force_phase, ripple_phase, stiffness_phase, 0.0)
 
     def lab_position(self, x):
@@ -223,7 +225,9 @@ def _with_clock(excitation, force_phase, ripple_phase, stiffness_phase, time):
 
 
 @compiled
-def _phase_at(frequency, phase, time):
+def _phase_at(amplitude, frequency, phase, time):
+    if amplitude == 0.0:
+        return phase
     angle = frequency * time + phase
     return angle % (2.0 * math.pi) if abs(angle) > 2.0 * math.pi else angle
 

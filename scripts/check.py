@@ -4,6 +4,7 @@
     python scripts/check.py --fix               mend what ruff can mend first
     python scripts/check.py --lint-only         all but the tests
     python scripts/check.py -k orbits -x        what is not an option of this script goes to pytest
+    python scripts/check.py -n 0                tests in one process (default: one for each core)
 
 All checks run even when one fails; the exit status is 1 if any did.
 """
@@ -67,7 +68,9 @@ def main(arguments: list[str] | None = None) -> int:
     if options.lint_only:
         return int(bool(failed))
     print("  next  pytest", flush=True)
-    if not run("pytest", [PYTHON, "-m", "pytest", *for_pytest]):
+    # One process for each core, unless the arguments say how many, or stop where a process of its own would hide it.
+    alone = any(argument.startswith(("-n", "--numprocesses", "--pdb", "-s")) for argument in for_pytest)
+    if not run("pytest", [PYTHON, "-m", "pytest", *([] if alone else ["-n", "auto"]), *for_pytest]):
         failed.append("pytest")
     if failed:
         print(f"\nFAILED: {', '.join(failed)}", file=sys.stderr)

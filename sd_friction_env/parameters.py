@@ -1,6 +1,7 @@
 """The oscillator's parameters as a person types them: checked, frozen, and convertible from a rig in SI units."""
 
 import dataclasses
+import functools
 import math
 import numbers
 from collections.abc import Mapping
@@ -311,12 +312,12 @@ class OscillatorParameters:
         """The belt's speed at t = 0, ripple included."""
         return self.belt_speed + self.ripple_amplitude * math.cos(self.ripple_phase)
 
-    @property
+    @functools.cached_property
     def discontinuous(self) -> bool:
         """Whether x = 0 switches the spring's force: alpha = 0."""
         return bool(self.geometry == "exact" and self.alpha == 0.0)
 
-    @property
+    @functools.cached_property
     def law_numbers(self) -> dict[str, float]:
         """The numbers of laws of one's own, as ``friction.name`` and ``geometry.name``."""
         numbers: dict[str, float] = {}
@@ -327,18 +328,18 @@ class OscillatorParameters:
                 numbers.update(zip(names, kernel.leaves_of(law), strict=True))
         return numbers
 
-    @property
+    @functools.cached_property
     def values(self) -> dict[str, float]:
         """All numbers by name, those of laws of one's own too."""
         return {name: getattr(self, name) for name in RANGES} | self.law_numbers
 
-    @property
+    @functools.cached_property
     def kind(self) -> "Kind":
         """The laws without their numbers."""
         geometry = "discontinuous" if self.discontinuous else _blank(self.geometry)
         return Kind(geometry, _blank(self.friction), self.excited)
 
-    @property
+    @functools.cached_property
     def plant(self) -> Plant:
         """The values that compiled code takes."""
         return plant_of(self.kind, self.values)

@@ -210,6 +210,7 @@ def _steppers_of(shape: Any) -> Steppers:
     @in_lanes
     def advance_block(w, sub, m, interval, one_plant, tables):
         """Advance m lanes side by side; return how many of them ended with a status other than OK."""
+        none = 0 * m  # 0, which numba does not know: it would compile what takes a known number once more
         stuck = 0
         for i in range(m):
             stuck += 1 if w[LANE_V * STRIDE + i] == w[LANE_BELT * STRIDE + i] else 0
@@ -221,20 +222,20 @@ def _steppers_of(shape: Any) -> Steppers:
                 w[LANE_DONE * STRIDE + i] = 0.0
         if stuck > 0:
             # Few or many, those that stick are gathered and stepped side by side.
-            n = 0
+            n = none
             for i in range(m):
                 if w[LANE_V * STRIDE + i] == w[LANE_BELT * STRIDE + i]:
                     gather(w, i, sub, n, one_plant)
                     n += 1
             for i in range(_whole(n)):
                 stick_lane(read(sub, LANE_PLANT, STRIDE, i, tables), sub, i, interval)
-            n = 0
+            n = none
             for i in range(m):
                 if w[LANE_V * STRIDE + i] == w[LANE_BELT * STRIDE + i]:
                     scatter_stuck(sub, n, w, i, interval)
                     n += 1
         failures = 0
-        n = 0
+        n = none
         leaving = 0
         for i in range(m):
             if w[LANE_DONE * STRIDE + i] == 0.0:
@@ -245,12 +246,12 @@ def _steppers_of(shape: Any) -> Steppers:
                 if queue_look(plant, w, i, sub, n, interval, one_plant):
                     n += 1
                 else:
-                    failures += advance_after_trial(plant, w, i, sub, 0, interval, 1.0)
+                    failures += advance_after_trial(plant, w, i, sub, n, interval, 1.0)
         if n > 0:
             # Events in the midst of a slip step are looked at side by side as well.
             for i in range(_whole(n)):
                 look_lane(read(sub, LANE_PLANT, STRIDE, i, tables), sub, i, interval)
-        onward = 0
+        onward = none
         for j in range(n):
             i = int(sub[LOOK_LANE * STRIDE + j])
             if scatter_finished(w, i, sub, j):

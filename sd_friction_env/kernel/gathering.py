@@ -107,7 +107,7 @@ def queue_crossing(plant, w, i, sub, j, n, one_plant, interval):
     int_fv = sub[ONWARD_FV_THERE * STRIDE + j]
     low = min(x, x_event)
     high = max(x, x_event)
-    _queue_onward(w, i, sub, n, one_plant, interval, t, x_event, mode, 1, 0.0, int_v2, int_fv, low, high)
+    _queue_onward(w, i, sub, n, one_plant, interval, t, x_event, mode, 1.0, 0.0, int_v2, int_fv, low, high)
     return True
 
 
@@ -124,7 +124,7 @@ def queue_breakaway(plant, w, i, sub, n, one_plant, interval):
         return False
     mode = mode_at_zero_v_rel(plant, x, drive)
     if mode != STICK:
-        _queue_onward(w, i, sub, n, one_plant, interval, 0.0, x, mode, 0, 0.0, 0.0, 0.0, x, x)
+        _queue_onward(w, i, sub, n, one_plant, interval, 0.0, x, mode, 0.0, 0.0, 0.0, 0.0, x, x)
         return True
     leg = stick_leg(plant, x, drive, interval)
     if leg.event == BREAKAWAY:
@@ -141,7 +141,7 @@ def queue_breakaway(plant, w, i, sub, n, one_plant, interval):
             leg.time,
             leg.x,
             mode,
-            1,
+            1.0,
             leg.time,
             leg.int_v2,
             leg.int_fv,

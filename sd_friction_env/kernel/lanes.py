@@ -110,8 +110,8 @@ def _rides(plant, x, drive, t):
     belt_end = belt + a_belt * t
     reach = 0.124 * plant.spring.length_scale()
     holds = (abs(belt) * t <= reach) & (abs(belt_end) * t <= reach) & (belt * belt_end >= 0.0)
-    holds = holds & _cone_side_holds(plant, -1, x, drive, t)
-    holds = holds & _cone_side_holds(plant, 1, x, drive, t)
+    holds = holds & _cone_side_holds(plant, -1.0, x, drive, t)
+    holds = holds & _cone_side_holds(plant, 1.0, x, drive, t)
     dx, int_v2, int_fv = ride(plant, x, drive, t)
     holds = holds & stays_on_side(plant, x, x + dx)
     return holds, x + dx, int_v2, int_fv

@@ -98,7 +98,7 @@ def stick_until_event(plant, x, drive, duration):
         switches, t_end = _find_switching_in_stick(plant, x, drive, t, t_end)
         first = t_end
         found = False
-        for side in (-1, 1):
+        for side in (-1.0, 1.0):
             excess, slope = cone_excess(plant, side, x, drive, t)
             excess_end, slope_end = cone_excess(plant, side, x, drive, t_end)
             high = t_end

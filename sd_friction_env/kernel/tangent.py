@@ -179,7 +179,7 @@ def saltation(plant, mode, after, kind, x, v, v_belt):
             return 0.0, 1.0, True
         return 0.0, _acceleration(plant, after, x, v, v_belt) / a, False
     if kind == BREAKAWAY:
-        side = -after
+        side = float(-after)
         _, slope = cone_excess(plant, side, x, steady(v_belt), 0.0)
         if not slope > 0.0:
             return 0.0, 0.0, True
@@ -214,7 +214,7 @@ def _event_due(plant, mode, side, x, v, v_belt):
     if plant.spring.switches() and side * w < 0.0 and side * plant.excitation.lab_position(x) <= SECTION_TIME * abs(w):
         return SWITCHING
     if mode == STICK:
-        for cone_side in (-1, 1):
+        for cone_side in (-1.0, 1.0):
             excess, slope = cone_excess(plant, cone_side, x, steady(v_belt), 0.0)
             if slope > 0.0 and excess >= -SECTION_TIME * slope:
                 return BREAKAWAY

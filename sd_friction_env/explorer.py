@@ -26,7 +26,15 @@ from sd_friction_env.basins import basin_grid
 from sd_friction_env.curves import amplitude_curve
 from sd_friction_env.env import SDFrictionEnv
 from sd_friction_env.orbits import LimitCycle, OrbitError, limit_cycle
-from sd_friction_env.parameters import FRICTIONS, GEOMETRIES, STATE_LIMIT, Kind, OscillatorParameters
+from sd_friction_env.parameters import (
+    EXCITATIONS,
+    FIELDS,
+    FRICTIONS,
+    GEOMETRIES,
+    STATE_LIMIT,
+    Kind,
+    OscillatorParameters,
+)
 from sd_friction_env.plotting import BLACK, BLUE, GREEN, GREY, VERMILION
 from sd_friction_env.policies import ConstantPolicy, Policy, State, VelocityFeedback, ZeroPolicy
 from sd_friction_env.pretrained import load_pretrained
@@ -39,29 +47,42 @@ OFF, FEEDBACK, AGENT, ROBUST, HAND = "off", "velocity feedback", "trained agent"
 PLUGINS = "sd_friction_env.controllers"  # group of entry points: functions from an environment's id to a policy
 
 # Ranges of the sliders (parameters.RANGES allows more): first, last, step.
-SLIDERS: dict[str, tuple[str, float, float, float]] = {
-    "belt_speed": ("belt speed v_b", 0.02, 0.6, 0.005),
-    "alpha": ("anchor height alpha", 0.0, 1.2, 0.01),
-    "g1": ("weight g1", 0.5, 2.0, 0.05),
-    "beta": ("damping beta", 0.0, 0.15, 0.005),
-    "mu_s": ("static friction mu_s", 0.05, 0.5, 0.01),
-    "mu_m": ("least friction mu_m", 0.0, 0.3, 0.01),
-    "v_m": ("speed of least friction v_m", 0.2, 1.0, 0.05),
+_SLIDERS = {
+    "belt_speed": (0.02, 0.6, 0.005),
+    "alpha": (0.0, 1.2, 0.01),
+    "g1": (0.5, 2.0, 0.05),
+    "beta": (0.0, 0.15, 0.005),
+    "mu_s": (0.05, 0.5, 0.01),
+    "mu_m": (0.0, 0.3, 0.01),
+    "v_m": (0.2, 1.0, 0.05),
 }
 # On the second tab: what other laws use, and excitation.
-LAW_SLIDERS: dict[str, tuple[str, float, float, float]] = {
-    "mu_k": ("kinetic friction mu_k (coulomb, exponential)", 0.0, 0.3, 0.01),
-    "delta": ("fall delta (hyperbolic)", 0.0, 10.0, 0.1),
-    "v_0": ("speed of decay v_0 (exponential)", 0.05, 2.0, 0.05),
-    "mu_v": ("viscous part mu_v (exponential)", 0.0, 0.5, 0.01),
-    "kappa": ("stiffening kappa (duffing)", 0.0, 5.0, 0.1),
-    "force_amplitude": ("exciting force", 0.0, 0.5, 0.01),
-    "force_frequency": ("its frequency", 0.1, 5.0, 0.05),
-    "ripple_amplitude": ("ripple on the belt's speed", 0.0, 0.3, 0.01),
-    "ripple_frequency": ("its frequency", 0.1, 5.0, 0.05),
-    "stiffness_amplitude": ("modulation of the stiffness", 0.0, 1.0, 0.02),
-    "stiffness_frequency": ("its frequency", 0.1, 5.0, 0.05),
+_LAW_SLIDERS = {
+    "mu_k": (0.0, 0.3, 0.01),
+    "delta": (0.0, 10.0, 0.1),
+    "v_0": (0.05, 2.0, 0.05),
+    "mu_v": (0.0, 0.5, 0.01),
+    "linear_stiffness": (-2.0, 2.0, 0.05),
+    "kappa": (0.0, 5.0, 0.1),
+    "force_amplitude": (0.0, 0.5, 0.01),
+    "force_frequency": (0.1, 5.0, 0.05),
+    "ripple_amplitude": (0.0, 0.3, 0.01),
+    "ripple_frequency": (0.1, 5.0, 0.05),
+    "stiffness_amplitude": (0.0, 1.0, 0.02),
+    "stiffness_frequency": (0.1, 5.0, 0.05),
 }
+
+
+def _titled(ranges: dict[str, tuple[float, float, float]]) -> dict[str, tuple[str, float, float, float]]:
+    """Return ranges with the sliders' titles before them, from the table of parameters."""
+    titles = {}
+    for name in ranges:
+        meaning, law = FIELDS[name]["meaning"], FIELDS[name]["law"]
+        titles[name] = f"{meaning} ({law})" if law and law not in EXCITATIONS and law != "stribeck" else meaning
+    return {name: (titles[name], *ends) for name, ends in ranges.items()}
+
+
+SLIDERS, LAW_SLIDERS = _titled(_SLIDERS), _titled(_LAW_SLIDERS)
 _GAIN = 1.5
 _LONGEST = 1_000_000  # steps of an episode: nobody looks on for so long
 _TRAIL, _HISTORY = 200, 600  # control intervals shown

@@ -289,3 +289,18 @@ def test_an_edit_of_a_callee_in_another_file_or_of_a_users_law_renews_the_caller
     assert told() == ["-1", "1.0", "1"]
     spring.write_text(spring.read_text() + "\n    def normal_force(self, weight, x):\n        return 3.0 * weight\n")
     assert told() == ["-1", "3.0"]
+
+
+def test_what_is_compiled_for_a_law_of_a_script_is_kept(tmp_path):
+    (tmp_path / "script.py").write_text(OWN + ASK.replace("from own import Level\n", ""))
+
+    def told():
+        process = run([str(tmp_path / "script.py")], tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+        out, error = process.communicate(timeout=300)
+        assert out, error
+        return out.split(), error
+
+    assert told()[0] == ["0", "1.0"]
+    assert told() == (["0", "1.0", "1"], "")
+    (tmp_path / "script.py").write_text((tmp_path / "script.py").read_text().replace("Level(0.5)", "Level(0.0)"))
+    assert told()[0] == ["-1", "1.0"]

@@ -24,6 +24,7 @@ from numba.core import event, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import CPUDispatcher
+from numba.core.serialize import NumbaPickler
 
 NO_FOLDER = "compiled code cannot be kept, no folder for it can be written: set NUMBA_CACHE_DIR to one that can"
 _KERNEL = Path(__file__).parent
@@ -59,6 +60,19 @@ def _say_once(kind: str, text: str) -> None:
         _say(text)
 
 
+def _of_main(name: str) -> Any:
+    return getattr(sys.modules["__main__"], name)
+
+
+class _ByName(NumbaPickler):
+    """numba's pickler, but laws of the program that runs are found by name, not copied: a copy is another type."""
+
+    def reducer_override(self, found: Any) -> Any:
+        if isinstance(found, type) and issubclass(found, tuple) and found.__module__ == "__main__":
+            return _of_main, (found.__name__,)
+        return super().reducer_override(found)
+
+
 class _CheckedFiles(IndexDataCacheFile):
     """numba's files of one function, each with a digest at its end, which unpickling does not read."""
 
@@ -87,6 +101,11 @@ class _CheckedFiles(IndexDataCacheFile):
     def _load_data(self, name: str) -> Any:
         self._check(self._data_path(name))
         return super()._load_data(name)
+
+    def _dump(self, content: Any) -> bytes:
+        target = io.BytesIO()
+        _ByName(target, protocol=4).dump(content)
+        return target.getvalue()
 
     def save(self, key: Any, data: Any) -> None:
         super().save(key, (self._source_stamp, key, data))
@@ -122,9 +141,16 @@ def _laws_of(function: Callable[..., Any], signature: Any) -> set[Any]:
 
 
 def _is_kept(function: Callable[..., Any], signature: Any) -> bool:
-    """Whether another process can find the laws of a function by their names: those of a script or a session cannot."""
+    """Whether another process can find the laws of a function by name and file: not those of a session."""
     laws = (law for law in _laws_of(function, signature) if isinstance(law, type))
-    return not any(law.__module__ == "__main__" or "<locals>" in law.__qualname__ for law in laws)
+    return all("<locals>" not in law.__qualname__ and Path(_file_of(law)).is_file() for law in laws)
+
+
+def _file_of(law: type) -> str:
+    try:
+        return inspect.getfile(law)
+    except (OSError, TypeError):  # a session's
+        return ""
 
 
 @functools.cache

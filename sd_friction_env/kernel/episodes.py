@@ -173,7 +173,7 @@ def _observed(value, offset, scale, limit):
     return scaled if abs(scaled) <= limit else math.copysign(limit, scaled)
 
 
-@compiled
+@in_lanes
 def _sense(task, codes, counts, past, x, v, i):
     """Return x and v of environment i as its sensor gives them: some intervals old, with the noise of that time."""
     if task[TASK_SENSOR_NOISE] > 0.0:
@@ -194,7 +194,7 @@ def _sense(task, codes, counts, past, x, v, i):
     return past[oldest, 0, i], past[oldest, 1, i]
 
 
-@compiled
+@in_lanes
 def observe_one(task, codes, state, counts, past, shown, phases, observations, i):
     """Write what environment i observes into its row of ``observations`` (n, size), float32.
 

@@ -477,13 +477,12 @@ class SDFrictionVectorEnv(KnowsItsLength, VectorEnv[NDArray[np.float32], NDArray
         """
         kinds = self._kinds_in(numbers, laws)
         values = dict(zip(self._names, numbers, strict=True))
-        plants = [
-            kernel.leaves_of(
-                plant_of(kind, {name: rows[columns] for name, rows in values.items()}),
-                plant_of(kind, self.nominal.values),
-            )
-            for kind, columns in kinds
-        ]
+        plants = []
+        for kind, columns in kinds:
+            # The batch's names are those of the nominal laws: another law of a user's own has its numbers in itself.
+            names = self._names if laws[columns[0]] == 0 else tuple(RANGES)
+            here = {name: values[name][columns] for name in names}
+            plants.append(kernel.leaves_of(plant_of(kind, here), plant_of(kind, self.nominal.values)))
         state = np.zeros((kernel.STATE_PLANT + max(map(len, plants)), len(which)))
         for (_, columns), leaves in zip(kinds, plants, strict=True):
             for leaf, row in enumerate(leaves):
@@ -1145,16 +1144,22 @@ def _checked_seed(seed: Any) -> int:
 def _entries(name: str, value: Any, num_envs: int) -> list[Any]:
     """Return what a value says of every environment: the entries of an array, or else the value for all."""
     value = without_axes(value)
-    if not isinstance(value, np.ndarray | list | tuple):
+    if not isinstance(value, np.ndarray | list | tuple) or _is_law(value):
         return [value] * num_envs
     if isinstance(value, np.ndarray) and value.ndim > 1:
         raise ValueError(f"{name} must be one value or {num_envs}, got shape {value.shape}")
     if len(value) != num_envs:
         raise ValueError(f"{name} must be one value or {num_envs}, got {len(value)}")
     for entry in value:
-        if isinstance(entry, list | tuple) or (isinstance(entry, np.ndarray) and entry.ndim > 0):
+        if (isinstance(entry, list | tuple) and not _is_law(entry)) or (
+            isinstance(entry, np.ndarray) and entry.ndim > 0
+        ):
             raise ValueError(f"{name} must be one value or {num_envs}, got {entry!r} among them")
     return [without_axes(entry) for entry in value]
+
+
+def _is_law(value: Any) -> bool:
+    return isinstance(value, tuple) and hasattr(value, "_fields")
 
 
 def _checked_batch_options(options: Any, num_envs: int) -> tuple[NDArray[np.bool_] | None, list[dict[str, Any]] | None]:

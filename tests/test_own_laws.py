@@ -370,3 +370,55 @@ def test_lanes_of_each_law_give_the_bits_of_single_environments(law):
                 assert (observation == observations[i]).all(), (i, law)
                 assert reward == rewards[i]
                 over[i] = terminated or truncated
+
+
+@friction_law
+class OwnCoulomb(NamedTuple):
+    """Level friction, with a number of the same name as one of :class:`OwnStribeck`."""
+
+    mu_s: float
+    k1: float
+
+    def coefficient(self, mode, v_rel):
+        return mode * self.k1
+
+    def slope(self, mode, v_rel):
+        return 0.0
+
+    def curvature(self, mode, v_rel):
+        return 0.0
+
+    def third_derivative(self, mode, v_rel):
+        return 0.0
+
+
+def test_numbers_of_one_users_law_are_not_taken_for_those_of_another():
+    laws = [OwnCoulomb(0.4, 0.3), OwnStribeck(0.3, 0.2, 0.1), OWN.friction, "coulomb", OwnCoulomb(0.2, 0.1)]
+    per_env = [{"parameters": {"friction": law}} for law in laws]
+    envs = gym.make_vec("SDFriction/Force-v0", len(laws), parameters=OWN, start="random")
+    observations, _ = envs.reset(seed=2, options=per_env)
+    actions = np.linspace(-1.0, 1.0, len(laws), dtype=np.float32)[:, None]
+    for _ in range(30):
+        observations, rewards, *_ = envs.step(actions)
+    for i, law in enumerate(laws):
+        env = gym.make("SDFriction/Force-v0", parameters=OWN, start="random").unwrapped
+        env.reset(seed=2 + i, options=per_env[i])
+        for _ in range(30):
+            observation, reward, *_ = env.step(actions[i])
+        assert (observation == observations[i]).all(), law
+        assert reward == rewards[i]
+        assert envs.unwrapped.get_states()[i].parameters.friction == law
+
+
+def test_a_law_in_the_options_of_a_whole_batch_is_one_value():
+    envs = gym.make_vec("SDFriction/Force-v0", 2, start="random").unwrapped
+    envs.reset(seed=0, options={"parameters": {"friction": OwnCoulomb(0.3, 0.2)}})
+    assert [state.parameters.friction for state in envs.get_states()] == [OwnCoulomb(0.3, 0.2)] * 2
+
+
+def test_a_friction_law_without_a_coefficient_of_stick_is_refused():
+    methods = {name: getattr(OwnCoulomb, name) for name in ("coefficient", "slope", "curvature", "third_derivative")}
+    with pytest.raises(
+        TypeError, match=r"Stickless lacks the field mu_s or the method breakaway_coefficient\(self, mode\)"
+    ):
+        friction_law(type("Stickless", (NamedTuple("Stickless", [("k1", float)]),), methods))

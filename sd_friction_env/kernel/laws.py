@@ -73,10 +73,12 @@ def _law_class(kind: str, protocol: dict[str, Callable[..., Any]], law: type) ->
         raise TypeError(f"a {kind} law must be a NamedTuple class with at least one field, got {law!r}")
     for name, described in protocol.items():
         method = getattr(law, name, None)
+        wanted = inspect.signature(described)
         if method is None and name in OPTIONAL:
+            if name == "breakaway_coefficient" and "mu_s" not in fields:
+                raise TypeError(f"the {kind} law {law.__name__} lacks the field mu_s or the method {name}{wanted}")
             setattr(law, name, OPTIONAL[name])
             continue
-        wanted = inspect.signature(described)
         if not inspect.isfunction(method):
             text = (described.__doc__ or "").strip()
             raise TypeError(f"the {kind} law {law.__name__} lacks the method {name}{wanted}: {text}")

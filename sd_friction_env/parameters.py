@@ -110,8 +110,7 @@ class OscillatorParameters:
     Attributes:
         geometry: "exact" (R and N of Eq. 4), "cubic" (their Taylor polynomials, Eq. 9: what the paper's figures show),
             "linear" (R = x, N = g1: the belt of Thomsen and Fidlin), "duffing" (R = linear_stiffness x + kappa x^3,
-            N = g1), or a spring
-            of your own (:func:`spring_law`).
+            N = g1), or a spring of your own (:func:`spring_law`).
         alpha: height of the spring's anchor over the belt, H/L, in [0.001, 10]; unused by "linear" and "duffing". With
             "exact" also 0, the discontinuous limit R = x - sgn(x), N = g1: x = 0 switches the spring's force, which a
             mass that moves meets as on the side it moves to, and one at rest there as 0.
@@ -197,10 +196,10 @@ class OscillatorParameters:
         K: float,
         C: float,
         L: float | None = None,
-        H: float = 0.0,
+        H: float | None = None,
         g: float = 9.80665,
-        V0: float = 0.0,
-        mu_s: float = 0.2,
+        V0: float | None = None,
+        mu_s: float | None = None,
         mu_m: float | None = None,
         V_m: float | None = None,
         *,
@@ -213,12 +212,12 @@ class OscillatorParameters:
         Args:
             M: mass, kg. K: spring stiffness, N/m. C: damping coefficient, N s/m.
             L: free length of the spring, m; the unit of length. Of a level spring None: M g/K, so that g1 is 1.
-            H: height of the spring's anchor over the belt, m; "exact" and "cubic" alone have one.
+            H: height of the spring's anchor over the belt, m; of "exact" and "cubic".
             g: acceleration of gravity (or the load that presses the mass on the belt, over M), m/s^2.
             V0: belt speed, m/s.
             mu_s, mu_m: friction coefficients. V_m: relative speed at which friction is least, m/s.
             geometry, friction: as in the class; the numbers of laws of your own are in SI units.
-            numbers: what else the laws need. ``mu_k``; ``V_0``, m/s; ``delta`` and ``mu_v``, s/m; ``K3``, the cubic
+            numbers: what else the laws need (``mu_v`` is 0 and ``linear_stiffness`` 1 if not given). ``mu_k``; ``V_0``, m/s; ``delta`` and ``mu_v``, s/m; ``K3``, the cubic
                 stiffness of "duffing", N/m^3; ``linear_stiffness``, over K; ``force_amplitude``, N;
                 ``ripple_amplitude``, m/s; ``stiffness_amplitude``; each with ``_frequency``, rad/s, and ``_phase``.
 
@@ -226,24 +225,28 @@ class OscillatorParameters:
         X = length_scale x, dX/dt = length_scale / time_scale x', F = force_scale u.
 
         Raises:
-            TypeError, ValueError: as the class does; M, K, L, g, V_m and V_0 must be positive.
+            TypeError: if a number that the laws need is not given, or one has no such name.
+            ValueError: as the class does; M, K, L, g, V_m and V_0 must be positive.
         """
-        if L is None:
-            if isinstance(geometry, str) and geometry in ("exact", "cubic"):
-                raise TypeError(f"L, the spring's free length in metres, must be given with geometry {geometry!r}")
-            checked_number("M", M, math.ulp(0.0), 1e12)
-            L = M * checked_number("g", g, math.ulp(0.0), 1e12) / checked_number("K", K, math.ulp(0.0), 1e12)
         given = {"mu_m": mu_m, "V_m": V_m, **numbers}
         given = {name: value for name, value in given.items() if value is not None}
         unknown = sorted(set(given) - set(_SI_NUMBERS))
         if unknown:
             raise TypeError(f"a rig has no number {unknown[0]!r}; allowed: {', '.join(_SI_NUMBERS)}")
-        positive = {"M": M, "K": K, "L": L, "g": g}
+        geometry = checked_spring_law("geometry", geometry, GEOMETRIES)
+        friction = checked_friction_law("friction", friction, FRICTIONS)
+        rig = {"L": L, "H": H, "V0": V0, "mu_s": mu_s, **given}
+        for name in ("V0", *(name for law in (geometry, friction) if isinstance(law, str) for name in _SI_NEEDED[law])):
+            if rig.get(name) is None:
+                raise TypeError(f"{name} must be given with geometry {geometry!r} and friction {friction!r}")
+        positive = {"M": M, "K": K, "g": g, **({} if L is None else {"L": L})}
         positive |= {name: given[name] for name in ("V_m", "V_0") if name in given}
         for name, value in positive.items():
             checked_number(name, value, math.ulp(0.0), 1e12)
-        for name, value in {"C": C, "H": H, "V0": V0}.items():
-            checked_number(name, value, 0.0, 1e12)
+        L = M * g / K if L is None else L
+        alpha = {} if H is None else {"alpha": checked_number("H", H, 0.0, 1e12) / L}
+        belt_speed = checked_number("V0", V0, 0.0, 1e12)
+        checked_number("C", C, 0.0, 1e12)
         omega0 = math.sqrt(K / M)
         speed = L * omega0
         units = {"": 1.0, "speed": speed, "1/speed": 1.0 / speed, "force": K * L, "frequency": omega0}
@@ -253,17 +256,17 @@ class OscillatorParameters:
             field, unit = _SI_NUMBERS[name]
             fields[field] = checked_number(name, value, -1e18, 1e18) / units[unit]
         if not isinstance(friction, str):
-            friction = ScaledFriction(checked_friction_law("friction", friction, FRICTIONS), speed)
+            friction = ScaledFriction(friction, speed)
         if not isinstance(geometry, str):
-            geometry = ScaledSpring(checked_spring_law("geometry", geometry, GEOMETRIES), L, K * L)
+            geometry = ScaledSpring(geometry, L, K * L)
         return cls(
             geometry=geometry,
             friction=friction,
-            **({"alpha": H / L} if H or geometry in ("exact", "cubic") else {}),
+            **alpha,
             g1=g / (L * omega0 * omega0),
             beta=C / (2.0 * M * omega0),
-            mu_s=mu_s,
-            belt_speed=V0 / speed,
+            **({} if mu_s is None else {"mu_s": mu_s}),
+            belt_speed=belt_speed / speed,
             time_scale=1.0 / omega0,
             length_scale=L,
             force_scale=K * L,
@@ -370,6 +373,17 @@ FIELDS: dict[str, Mapping[str, Any]] = {
 RANGES: dict[str, tuple[float, float]] = {name: field["range"] for name, field in FIELDS.items()}  # both ends included
 
 
+_SI_NEEDED = {  # by laws of a rig
+    "exact": ("L", "H"),
+    "cubic": ("L", "H"),
+    "linear": (),
+    "duffing": ("K3",),
+    "stribeck": ("mu_s", "mu_m", "V_m"),
+    "coulomb": ("mu_s", "mu_k"),
+    "hyperbolic": ("mu_s", "delta"),
+    "exponential": ("mu_s", "mu_k", "V_0"),
+    "gaussian": ("mu_s", "mu_k", "V_0"),
+}
 _SI_NUMBERS = {  # of a rig, by their names in SI units: the field, and what it is divided by
     **{name: (name, "") for name in ("mu_m", "mu_k", "linear_stiffness", "stiffness_amplitude")},
     **{f"{means}_phase": (f"{means}_phase", "") for means in EXCITATIONS},

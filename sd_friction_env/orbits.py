@@ -234,8 +234,8 @@ def equilibria(parameters: OscillatorParameters) -> list[Equilibrium]:
     if speed == 0.0:
         return []
     plant = parameters.plant
-    coefficient = -float(kernel.friction_coefficient(plant, kernel.SLIP_BACKWARD, -speed))
-    slope = float(kernel.friction_slope(plant, kernel.SLIP_BACKWARD, -speed))
+    coefficient = -float(plant.friction.coefficient(kernel.SLIP_BACKWARD, -speed))
+    slope = float(plant.friction.slope(kernel.SLIP_BACKWARD, -speed))
     found = []
     for x in balance_points(parameters, 0.0, coefficient):
         normal = kernel.normal_force(plant, x)
@@ -389,7 +389,7 @@ def limit_of_motion(parameters: OscillatorParameters, x: float, v: float) -> Lim
 
 def _is_frictionless(parameters: OscillatorParameters) -> bool:
     """Whether level friction is none at all, so that a lap on both sides of the belt's speed loses nothing either."""
-    return bool(kernel.friction_coefficient(parameters.plant, kernel.SLIP_BACKWARD, -parameters.belt_speed) == 0.0)
+    return bool(parameters.plant.friction.coefficient(kernel.SLIP_BACKWARD, -parameters.belt_speed) == 0.0)
 
 
 def _is_neutral(parameters: OscillatorParameters, x_max: float) -> bool:
@@ -974,12 +974,12 @@ def hopf_belt_speed(parameters: OscillatorParameters) -> float:
     plant = parameters.plant
 
     def damping(speed: float) -> float:
-        coefficient = -kernel.friction_coefficient(plant, kernel.SLIP_BACKWARD, -speed)
+        coefficient = -plant.friction.coefficient(kernel.SLIP_BACKWARD, -speed)
         points = balance_points(parameters, 0.0, coefficient)
         if not points:
             return math.nan
         normal = kernel.normal_force(plant, points[-1])
-        return float(2.0 * parameters.beta + normal * kernel.friction_slope(plant, kernel.SLIP_BACKWARD, -speed))
+        return float(2.0 * parameters.beta + normal * plant.friction.slope(kernel.SLIP_BACKWARD, -speed))
 
     _check_unexcited(parameters)
     speeds = _belt_speeds_to_search(parameters)

@@ -217,9 +217,10 @@ class OscillatorParameters:
             V0: belt speed, m/s.
             mu_s, mu_m: friction coefficients. V_m: relative speed at which friction is least, m/s.
             geometry, friction: as in the class; the numbers of laws of your own are in SI units.
-            numbers: what else the laws need (``mu_v`` is 0 and ``linear_stiffness`` 1 if not given). ``mu_k``; ``V_0``, m/s; ``delta`` and ``mu_v``, s/m; ``K3``, the cubic
-                stiffness of "duffing", N/m^3; ``linear_stiffness``, over K; ``force_amplitude``, N;
-                ``ripple_amplitude``, m/s; ``stiffness_amplitude``; each with ``_frequency``, rad/s, and ``_phase``.
+            numbers: what else the laws need. ``mu_k``; ``V_0``, m/s; ``delta``, s/m; ``mu_v``, s/m (0 if not given);
+                ``K3``, the cubic stiffness of "duffing", N/m^3; ``linear_stiffness``, over K (1 if not given);
+                ``force_amplitude``, N; ``ripple_amplitude``, m/s; ``stiffness_amplitude``; each with ``_frequency``,
+                rad/s, and ``_phase``.
 
         The results' ``time_scale``, ``length_scale`` and ``force_scale`` lead back: t = time_scale tau,
         X = length_scale x, dX/dt = length_scale / time_scale x', F = force_scale u.
@@ -364,7 +365,7 @@ class OscillatorParameters:
         """Return mu(v_rel); at v_rel = 0, where it is set-valued, 0."""
         if v_rel == 0:
             return 0.0
-        return float(kernel.friction_coefficient(self.plant, 1 if v_rel > 0 else -1, float(v_rel)))
+        return float(self.plant.friction.coefficient(1 if v_rel > 0 else -1, float(v_rel)))
 
 
 FIELDS: dict[str, Mapping[str, Any]] = {

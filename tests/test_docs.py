@@ -217,7 +217,7 @@ def test_the_notebook_runs_and_shows_what_is_kept(monkeypatch):
     for old, new in zip(kept.cells, now.cells, strict=True):
         if "model.learn" in old.source:  # from here on the budget shows
             break
-        # What a cell prints may come in one piece or in several, and what is being compiled is told on stderr.
+        # Output may be split into several pieces; messages about compilation go to stderr.
         told = [[o for o in cell.get("outputs", []) if o.get("name") != "stderr"] for cell in (old, new)]
         before, after = ("".join(output.get("text", "") for output in outputs) for outputs in told)
         assert before == after

@@ -35,12 +35,12 @@ def test_spring_laws_agree_with_hand_computed_values():
 
 
 def test_friction_falls_from_mu_s_to_mu_m_at_v_m_and_rises_again():
-    assert kernel.friction_coefficient(EXACT, 1, 0.0) == 0.2
-    assert kernel.friction_coefficient(EXACT, -1, 0.0) == -0.2
-    assert kernel.friction_coefficient(EXACT, 1, 0.5) == pytest.approx(0.05, abs=1e-16)
-    assert kernel.friction_slope(EXACT, 1, 0.5) == pytest.approx(0.0, abs=1e-15)
+    assert EXACT.friction.coefficient(1, 0.0) == 0.2
+    assert EXACT.friction.coefficient(-1, 0.0) == -0.2
+    assert EXACT.friction.coefficient(1, 0.5) == pytest.approx(0.05, abs=1e-16)
+    assert EXACT.friction.slope(1, 0.5) == pytest.approx(0.0, abs=1e-15)
     # by hand: k1 = .45, k3 = .6, so mu(.2) = .2 - .09 + .0048
-    assert kernel.friction_coefficient(EXACT, 1, 0.2) == pytest.approx(0.1148, rel=1e-14)
+    assert EXACT.friction.coefficient(1, 0.2) == pytest.approx(0.1148, rel=1e-14)
 
 
 @pytest.mark.parametrize("geometry", PLANTS)
@@ -50,7 +50,7 @@ def test_slopes_and_potential_are_those_of_the_forces(geometry, x):
     above, below = spring(plant, x + h), spring(plant, x - h)
     slopes = [(a - b) / (2.0 * h) for a, b in zip(above, below, strict=True)]
     assert (kernel.restoring_slope(plant, x), kernel.normal_slope(plant, x)) == pytest.approx(slopes, abs=1e-9)
-    force = (kernel.potential(plant, x + h) - kernel.potential(plant, x - h)) / (2.0 * h)
+    force = (plant.spring.potential(x + h) - plant.spring.potential(x - h)) / (2.0 * h)
     assert kernel.restoring_force(plant, x) == pytest.approx(force, abs=1e-9)
 
 

@@ -82,9 +82,9 @@ def test_energy_balances_over_every_interval(parameters, state, drive):
     plant = parameters.plant
     for (x0, v0, _, _, u), out, _ in intervals(parameters, state, drive):
         x, v, int_v2, int_fv = out[0], out[1], out[7], out[9]
-        change = 0.5 * (v * v - v0 * v0) + kernel.potential(plant, x) - kernel.potential(plant, x0)
+        change = 0.5 * (v * v - v0 * v0) + plant.spring.potential(x) - plant.spring.potential(x0)
         works = (-2.0 * parameters.beta * int_v2, int_fv, u * (x - x0))
-        size = 1.0 + sum(map(abs, works)) + 0.5 * v0 * v0 + abs(kernel.potential(plant, x0))
+        size = 1.0 + sum(map(abs, works)) + 0.5 * v0 * v0 + abs(plant.spring.potential(x0))
         assert change == pytest.approx(sum(works), abs=1e-9 * size)
 
 

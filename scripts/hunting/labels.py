@@ -76,13 +76,13 @@ def draw_starts(rng: np.random.Generator, parameters: OscillatorParameters, coun
 def stiffest(p: OscillatorParameters, x: float, v: float) -> float:
     """Return a rate that bounds the step of an explicit integration about a state."""
     speeds = (abs(v) + p.belt_speed, p.belt_speed, 1e-6)
-    slope = max(abs(kernel.friction_slope(p.plant, -1, -w)) for w in speeds)
+    slope = max(abs(p.plant.friction.slope(-1, -w)) for w in speeds)
     return float(max(15.0, 2.0 * p.beta + max(p.normal_force(x), p.normal_force(0.5 * x), p.g1) * slope))
 
 
 def conserves(p: OscillatorParameters) -> bool:
     """Whether neither the damper nor friction in slip depends on the speed."""
-    slopes = [kernel.friction_slope(p.plant, -1, -w) for w in np.geomspace(1e-6, 30.0, 50)]
+    slopes = [p.plant.friction.slope(-1, -w) for w in np.geomspace(1e-6, 30.0, 50)]
     return p.beta == 0.0 and not any(slopes)
 
 

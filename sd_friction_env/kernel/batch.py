@@ -131,17 +131,13 @@ def _steppers_of(shape: Any) -> Steppers:
     def plant_of(state, counts, i, time, tables):
         return at_time(read(state.reshape(-1), STATE_PLANT, state.shape[1], i, tables), time)
 
-    @compiled
-    def observe_many(task, codes, state, counts, past, shown, tables, observations, which):
+    @entry
+    def observe(task, codes, state, counts, past, shown, tables, observations, which):
+        """Write what the environments ``which`` (k,) observe; see :func:`observe_one`."""
         for i in which:
             plant = plant_of(state, counts, i, episode_time(state, counts, i, task[TASK_INTERVAL]), tables)
             phases = plant.excitation.phases() if codes[TASK_SEES_PHASES] else NO_PHASES
             observe_one(task, codes, state, counts, past, shown, phases, observations, i)
-
-    @entry
-    def observe(task, codes, state, counts, past, shown, tables, observations, which):
-        """Write what the environments ``which`` (k,) observe; see :func:`observe_one`."""
-        observe_many(task, codes, state, counts, past, shown, tables, observations, which)
 
     @entry
     def observe_alone(memory, observations):
@@ -156,7 +152,8 @@ def _steppers_of(shape: Any) -> Steppers:
     def step_one(memory, observations, action):
         """Step the one environment whose arrays lie in ``memory`` (:func:`arrays_in`), with an action in [-1, 1].
 
-        Write what it observes into ``observations`` (1, size). Return what it reports, see below.
+        Write what it observes into ``observations`` (1, size). Return what ``SDFrictionEnv.step`` puts into info, in
+        its order, then the reward and whether the episode was terminated or truncated.
         """
         task, codes, counts, state, w, past, shown, numbers, tables = arrays_in(without_refcount(memory), leaves)
         interval = task[TASK_INTERVAL]
@@ -311,16 +308,11 @@ def _steppers_of(shape: Any) -> Steppers:
         ``work`` (work_size,) is this call's own; with TASK_ONE_PLANT the plant and its belt speed stand in it already
         (:func:`fill_plant`). The belt's travel is only kept with TASK_TRAVEL. ``actions`` (n,) are finite; outside
         [-1, 1] they are clipped. ``wanted`` (k,) are the rows to report. Written are observations (n, size), rewards
-        (n,), over (2, n) (terminated, truncated), report (k, n) and report_codes (2, n) or (0, n). A step is that of
-        :func:`control_interval`.
+        (n,), over (2, n) (terminated, truncated), report (k, n) and report_codes (2, n) or (0, n).
         """
-        task, codes, work, tables = (
-            without_refcount(task),
-            without_refcount(codes),
-            without_refcount(work),
-            without_refcount(tables),
-        )
-        state, counts, past = without_refcount(state), without_refcount(counts), without_refcount(past)
+        task, codes, work = without_refcount(task), without_refcount(codes), without_refcount(work)
+        tables, state = without_refcount(tables), without_refcount(state)
+        counts, past = without_refcount(counts), without_refcount(past)
         shown, actions, wanted = without_refcount(shown), without_refcount(actions), without_refcount(wanted)
         observations, rewards = without_refcount(observations), without_refcount(rewards)
         over, report, report_codes = without_refcount(over), without_refcount(report), without_refcount(report_codes)
@@ -361,7 +353,7 @@ def _steppers_of(shape: Any) -> Steppers:
             if plain:
                 observe_block(task, codes, w, STRIDE, shown, observations, first, m)
             else:
-                observe_many(task, codes, state, counts, past, shown, tables, observations, range(first, first + m))
+                observe(task, codes, state, counts, past, shown, tables, observations, range(first, first + m))
         return ended
 
     @in_threads
@@ -391,7 +383,7 @@ def _steppers_of(shape: Any) -> Steppers:
             counts[COUNT_EPISODE, i] += 1
         blank_episodes(state, counts, which)
         place_on_cycle(state, counts, which, points, period, slot, tables)
-        observe_many(task, codes, state, counts, past, shown, tables, observations, which)
+        observe(task, codes, state, counts, past, shown, tables, observations, which)
 
     @entry
     def own_cycle_starts(state, counts, which, phases, tables):

@@ -30,63 +30,18 @@ def normal_slope(plant, x):
 
 
 @in_lanes
-def restoring_curvature(plant, x):
-    """Return R''(x) of the unmodulated spring."""
-    return plant.spring.restoring_curvature(x)
-
-
-@in_lanes
-def normal_curvature(plant, x):
-    """Return N''(x) of the unmodulated spring."""
-    return plant.spring.normal_curvature(x)
-
-
-@in_lanes
-def potential(plant, x):
-    """Return V(x), the integral of the unmodulated R from 0 to x."""
-    return plant.spring.potential(x)
-
-
-@in_lanes
 def energy_in_spring(plant, x):
     """Return V(x) at the plant's time: that of a modulated spring is as many times as great as its force."""
     return plant.excitation.modulated(plant.spring.potential(x))
 
 
 @in_lanes
-def friction_coefficient(plant, mode, v_rel):
-    """Return mu(v_rel) with its sign frozen to ``mode``."""
-    return plant.friction.coefficient(mode, v_rel)
-
-
-@in_lanes
-def friction_slope(plant, mode, v_rel):
-    """Return mu'(v_rel)."""
-    return plant.friction.slope(mode, v_rel)
-
-
-@in_lanes
-def friction_curvature(plant, mode, v_rel):
-    """Return mu''(v_rel)."""
-    return plant.friction.curvature(mode, v_rel)
-
-
-@in_lanes
-def friction_third_derivative(plant, mode, v_rel):
-    """Return mu'''(v_rel)."""
-    return plant.friction.third_derivative(mode, v_rel)
-
-
-@in_lanes
 def contact_and_acceleration(plant, mode, x, v, v_belt, u):
     """Return the contact force -mu N in slip, and the acceleration (Eq. 7 with a control force u)."""
     place = plant.excitation.lab_position(x)
-    contact = -plant.friction.coefficient(mode, v - v_belt) * plant.excitation.modulated_normal(
-        plant.g1, plant.spring.normal_force(plant.g1, place)
-    )
-    restoring = plant.excitation.modulated(plant.spring.restoring_force(place))
+    contact = -plant.friction.coefficient(mode, v - v_belt) * normal_force(plant, place)
     damping = 2.0 * plant.beta * plant.excitation.lab_velocity(v)
-    return contact, contact - damping - restoring + plant.excitation.drive_force(u)
+    return contact, contact - damping - restoring_force(plant, place) + plant.excitation.drive_force(u)
 
 
 @in_lanes
@@ -103,17 +58,15 @@ def stick_load(plant, x, drive):
     """
     plant = select_field(plant, x, drive.v_belt)
     excitation = plant.excitation
-    restoring = excitation.modulated(plant.spring.restoring_force(excitation.lab_position(x)))
     damping = 2.0 * plant.beta * excitation.lab_velocity(drive.v_belt)
+    restoring = restoring_force(plant, excitation.lab_position(x))
     return drive.a_belt + damping + restoring - excitation.drive_force(drive.u)
 
 
 @in_lanes
 def stick_limit(plant, mode, x):
     """Return the greatest load, in size, that stick bears before it gives way to slip in a mode: mu_s N."""
-    excitation = plant.excitation
-    normal = plant.spring.normal_force(plant.g1, excitation.lab_position(x))
-    return plant.friction.breakaway_coefficient(mode) * excitation.modulated_normal(plant.g1, normal)
+    return plant.friction.breakaway_coefficient(mode) * normal_force(plant, plant.excitation.lab_position(x))
 
 
 @in_lanes
@@ -153,7 +106,7 @@ def partial_time_derivatives(plant, place):
 def normal_force_rate(plant, x, v):
     """Return the rate of change of the normal force."""
     place = plant.excitation.lab_position(x)
-    rate = plant.excitation.modulated(plant.spring.normal_slope(place)) * plant.excitation.lab_velocity(v)
+    rate = normal_slope(plant, place) * plant.excitation.lab_velocity(v)
     return rate + partial_time_derivatives(plant, place)[2]
 
 
@@ -164,13 +117,9 @@ def slip_jerk(plant, mode, x, v, v_belt, a_belt, a):
     excitation = plant.excitation
     place = excitation.lab_position(x)
     w = excitation.lab_velocity(v)
-    normal = excitation.modulated_normal(plant.g1, plant.spring.normal_force(plant.g1, place))
-    contact = plant.friction.slope(mode, v_rel) * (a - a_belt) * normal
-    contact = (
-        contact + plant.friction.coefficient(mode, v_rel) * excitation.modulated(plant.spring.normal_slope(place)) * w
-    )
-    jerk = -contact - 2.0 * plant.beta * excitation.lab_acceleration(a)
-    jerk = jerk - excitation.modulated(plant.spring.restoring_slope(place)) * w
+    contact = plant.friction.slope(mode, v_rel) * (a - a_belt) * normal_force(plant, place)
+    contact = contact + plant.friction.coefficient(mode, v_rel) * normal_slope(plant, place) * w
+    jerk = -contact - 2.0 * plant.beta * excitation.lab_acceleration(a) - restoring_slope(plant, place) * w
     if excitation.acts():
         drive, restoring, normal_part = partial_time_derivatives(plant, place)
         jerk = jerk + drive - restoring - plant.friction.coefficient(mode, v_rel) * normal_part

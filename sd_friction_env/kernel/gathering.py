@@ -35,7 +35,7 @@ def gather(w, i, sub, n, one_plant):
 
 @compiled
 def scatter_stuck(sub, n, w, i, interval):
-    """Copy what came of a stuck lane n of the second work space to lane i."""
+    """Copy the results of lane n of the second work space, which sticks, to lane i."""
     for row in (LANE_X_END, LANE_BELT_END, LANE_INT_V2, LANE_INT_FV, LANE_X_MIN, LANE_X_MAX, LANE_NORMAL, LANE_DONE):
         w[row * STRIDE + i] = sub[row * STRIDE + n]
     w[LANE_V_END * STRIDE + i] = sub[LANE_BELT_END * STRIDE + n]

@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 from sd_friction_env.kernel.automaton import follow
 from sd_friction_env.kernel.codes import FORCE, OK, UNKNOWN
-from sd_friction_env.kernel.compilation import compiled, entry, in_lanes
-from sd_friction_env.kernel.forces import normal_force
-from sd_friction_env.kernel.plant import Drive, State, at_time
+from sd_friction_env.kernel.compilation import entry, in_lanes
+from sd_friction_env.kernel.plant import Drive, State
 from sd_friction_env.kernel.slip import UNTRIED
 
 
@@ -38,24 +37,6 @@ class Averages(NamedTuple):
     stick: float
 
 
-class Interval(NamedTuple):
-    """The end of a control interval, and what happened over it."""
-
-    x: float
-    v: float
-    v_belt: float
-    mode: int
-    status: int
-    n_events: int
-    time: float  # reached: that of the interval, if the status is OK
-    u: float
-    a_belt: float
-    averages: Averages
-    x_min: float
-    x_max: float
-    normal_force: float  # at the end
-
-
 @in_lanes
 def actuation(kind, authority, a_limit, belt_speed, interval, v_belt, action):
     """Return the force and the belt's acceleration that an action in [-1, 1] means."""
@@ -81,46 +62,25 @@ def interval_averages(x, x_end, int_v2, stick_time, int_fv, action, u, belt_spee
     )
 
 
-@compiled
-def control_interval(plant, actuator, state, v_belt, action):
-    """Apply an action in [-1, 1] for one control interval."""
-    kind, authority, a_limit, belt_speed, interval, w_effort, w_stick = actuator
-    u, a_belt = actuation(kind, authority, a_limit, belt_speed, interval, v_belt, action)
-    end = follow(plant, UNKNOWN, state, Drive(v_belt, a_belt, u), interval, None, UNTRIED)
-    averages = interval_averages(
-        state.x, end.x, end.int_v2, end.stick_time, end.int_fv, action, u, belt_speed, interval, w_effort, w_stick
-    )
-    normal = normal_force(at_time(plant, end.time), end.x)
-    return Interval(
-        end.x,
-        end.v,
-        end.v_belt,
-        end.mode,
-        end.status,
-        end.n_events,
-        end.time,
-        u,
-        a_belt,
-        averages,
-        end.x_min,
-        end.x_max,
-        normal,
-    )
-
-
 @entry
 def control_intervals(plant, actuator, x, v, v_belt, action, x_end, v_end, v_belt_end, reward):
-    """Apply :func:`control_interval` to n independent states.
+    """Apply actions in [-1, 1] to n independent states for one control interval.
 
     Arrays are of shape (n,); the last four take what comes out. Return how many ended with a status other than OK.
     """
+    kind, authority, a_limit, belt_speed, interval, w_effort, w_stick = actuator
     failures = 0
     for i in range(len(x)):
-        end = control_interval(plant, actuator, State(x[i], v[i]), v_belt[i], action[i])
+        u, a_belt = actuation(kind, authority, a_limit, belt_speed, interval, v_belt[i], action[i])
+        drive = Drive(v_belt[i], a_belt, u)
+        end = follow(plant, UNKNOWN, State(x[i], v[i]), drive, interval, None, UNTRIED)
+        averages = interval_averages(
+            x[i], end.x, end.int_v2, end.stick_time, end.int_fv, action[i], u, belt_speed, interval, w_effort, w_stick
+        )
         x_end[i] = end.x
         v_end[i] = end.v
         v_belt_end[i] = end.v_belt
-        reward[i] = end.averages.vibration + end.averages.effort + end.averages.stick
+        reward[i] = averages.vibration + averages.effort + averages.stick
         if end.status != OK:
             failures += 1
     return failures

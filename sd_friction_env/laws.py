@@ -8,7 +8,7 @@ import csv
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +144,7 @@ def checked_friction_law(name: str, value: Any, names: tuple[str, ...]) -> Any:
     Raises:
         ValueError: if it is neither, or a number of the law is not finite.
     """
-    return _checked(name, value, names, FRICTION, check_friction_law, "friction_law")
+    return _checked(name, value, names, FRICTION, _check_stick, check_friction_law, "friction_law")
 
 
 def checked_spring_law(name: str, value: Any, names: tuple[str, ...]) -> Any:
@@ -153,11 +153,17 @@ def checked_spring_law(name: str, value: Any, names: tuple[str, ...]) -> Any:
     Raises:
         ValueError: if it is neither, or a number of the law is not finite.
     """
-    return _checked(name, value, names, SPRING, check_spring_law, "spring_law")
+    return _checked(name, value, names, SPRING, _check_numbers, check_spring_law, "spring_law")
 
 
 def _checked(
-    name: str, value: Any, names: tuple[str, ...], protocol: Any, check: Callable[[Any], None], decorator: str
+    name: str,
+    value: Any,
+    names: tuple[str, ...],
+    protocol: Any,
+    check_values: Callable[[Any], None],
+    check_all: Callable[[Any], None],
+    decorator: str,
 ) -> Any:
     if isinstance(value, str) and value in names:
         return value
@@ -167,7 +173,7 @@ def _checked(
         text = text if len(text) <= 300 else f"{text[:100]}... ({len(text)} characters)"
         choices = ", ".join(map(repr, names))
         raise ValueError(f"{name} must be one of {choices}, or a law declared with @{decorator}, got {text}")
-    check(value)
+    (check_values if _is_built_in(value) else check_all)(value)
     return value
 
 
@@ -175,11 +181,31 @@ def _checked(
 def check_friction_law(law: Any) -> None:
     """Check that a friction law is finite, no stronger in slip than in stick at v_rel = 0, and compare its derivatives.
 
-    They are compared with differences, in both modes, at speeds from 0.01 to 5; those of built-in laws are not.
+    They are compared with differences, in both modes, at speeds from 0.01 to 5.
 
     Raises:
         ValueError: names the law, the method, the place, the value and what it should be.
     """
+    _check_stick(law)
+    for mode in (-1, 1):
+        for speed in _SPEEDS:
+            _check_chain(law, _FRICTION_CHAIN, functools.partial(_friction_value, law, mode), mode * speed)
+
+
+@functools.lru_cache(maxsize=1024)
+def check_spring_law(law: Any) -> None:
+    """Check that a spring is finite, and compare its derivatives with differences, at places within 2 of x = 0.
+
+    Raises:
+        ValueError: names the law, the method, the place, the value and what it should be.
+    """
+    _check_numbers(law)
+    for place in _PLACES:
+        for chain in _SPRING_CHAINS:
+            _check_chain(law, chain, functools.partial(_spring_value, law), place)
+
+
+def _check_stick(law: Any) -> None:
     _check_numbers(law)
     for mode in (-1, 1):
         limit, slip = law.breakaway_coefficient(mode), mode * law.coefficient(mode, 0.0)
@@ -192,24 +218,6 @@ def check_friction_law(law: Any) -> None:
                 f"{_name(law)}.coefficient({mode}, 0.0) must not exceed breakaway_coefficient({mode}) = {limit!r} in "
                 f"size, got {slip!r}: what slips could not come to rest"
             )
-    for part in _own_parts(law):
-        for mode in (-1, 1):
-            for speed in _SPEEDS:
-                _check_chain(part, _FRICTION_CHAIN, functools.partial(_friction_value, part, mode), mode * speed)
-
-
-@functools.lru_cache(maxsize=1024)
-def check_spring_law(law: Any) -> None:
-    """Check that a spring is finite, and compare its derivatives with differences, at places within 2 of x = 0.
-
-    Raises:
-        ValueError: names the law, the method, the place, the value and what it should be.
-    """
-    _check_numbers(law)
-    for part in _own_parts(law):
-        for place in _PLACES:
-            for chain in _SPRING_CHAINS:
-                _check_chain(part, chain, functools.partial(_spring_value, part), place)
 
 
 def _name(law: Any) -> str:
@@ -224,14 +232,9 @@ def _check_numbers(law: Any) -> None:
             raise ValueError(f"{_name(law)}.{name} must be a finite number, got {value!r}")
 
 
-def _own_parts(law: Any) -> Iterator[Any]:
-    """Yield the law, or the laws in it, that are not built in."""
-    if not type(law).__module__.startswith(_KERNEL):
-        yield law
-    else:
-        for part in law:
-            if isinstance(part, tuple):
-                yield from _own_parts(part)
+def _is_built_in(law: Any) -> bool:
+    parts = (part for part in law if isinstance(part, tuple))
+    return type(law).__module__.startswith(_KERNEL) and all(map(_is_built_in, parts))
 
 
 def _friction_value(law: Any, mode: int, method: str, v_rel: float) -> float:

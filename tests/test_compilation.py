@@ -4,6 +4,7 @@ import importlib.util
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -167,6 +168,50 @@ def run(code, folder, **environment):
         stderr=subprocess.PIPE,
         text=True,
     )
+
+
+SLOW = """
+import faulthandler, math, signal
+from typing import NamedTuple
+from sd_friction_env.kernel.compilation import entry
+
+faulthandler.enable()
+
+class Pair(NamedTuple):
+    first: float
+    second: float
+
+class Result(NamedTuple):
+    pair: Pair
+    steps: int
+
+@entry
+def sines(n):
+    total = 0.0
+    for i in range(n):
+        total += math.sin(total + i)
+    return Result(Pair(total, 2.0 * total), n)
+
+short = sines(3)
+assert type(short) is Result and type(short.pair) is Pair and short.steps == 3
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+for _ in range(3):
+    signal.setitimer(signal.ITIMER_REAL, 0.05)
+    try:
+        while True:
+            sines(30_000_000)
+    except KeyboardInterrupt:
+        print("interrupted")
+assert sines(3) == short
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="a signal by the clock")
+def test_an_interrupt_of_compiled_code_that_returns_a_named_tuple_is_no_crash(tmp_path):
+    (tmp_path / "slow.py").write_text(SLOW)
+    for _ in range(2):  # compiled, then loaded
+        out, error = run("import slow", tmp_path, NUMBA_CACHE_DIR="").communicate(timeout=120)
+        assert (out, error) == ("interrupted\n" * 3, "")
 
 
 def test_processes_that_compile_at_once_give_and_leave_what_is_right(tmp_path):

@@ -24,7 +24,7 @@ from sd_friction_env import (
     spring_law,
     tabulated_friction,
 )
-from sd_friction_env.laws import Coulomb, Stribeck
+from sd_friction_env.laws import Coulomb, Exponential, Gaussian, Hyperbolic, Stribeck
 
 
 @friction_law
@@ -218,6 +218,33 @@ def test_whole_numbers_in_a_law_are_taken_as_floats():
     assert law == (1.0, 0.0, 0.0)
     assert all(type(number) is float for number in law)
     check_spring_law(OwnLinear(2))
+
+
+def test_the_derivatives_of_all_built_in_laws_are_those_of_differences():
+    table = tabulated_friction([0.0, 0.2, 0.5, 1.1, 3.0], [0.4, 0.3, 0.24, 0.26, 0.3])
+    frictions = [
+        Stribeck(0.3, 0.4, 0.2),
+        Coulomb(0.3, 0.2),
+        Hyperbolic(0.3, 2.0, 0.02),
+        Exponential(0.3, 0.1, 0.4, 0.02),
+        Gaussian(0.3, 0.1, 0.4, 0.02),
+        table,
+        Asymmetric(Gaussian(0.3, 0.1, 0.4, 0.0), Hyperbolic(0.4, 1.5, 0.01)),
+    ]
+    for law in (*frictions, *(kernel.ScaledFriction(law, 1.7) for law in frictions)):
+        check_friction_law(law)
+    springs = [
+        kernel.Inclined(0.7),
+        kernel.Cubic(0.9),
+        kernel.Linear(1.0),
+        kernel.Duffing(-0.8, 1.3),
+        kernel.Discontinuous(0.0),
+    ]
+    for spring in (*springs, *(kernel.ScaledSpring(spring, 0.3, 2.5) for spring in springs[:-1])):
+        check_spring_law(spring)
+    widths = [Asymmetric(Gaussian(0.3, 0.1, 0.4, 0.0), Coulomb(0.4, 0.2)).layer_width(mode) for mode in (-1, 1)]
+    assert widths == [0.4, 0.0]
+    assert kernel.ScaledFriction(Gaussian(0.3, 0.1, 0.4, 0.0), 2.0).layer_width(1) == 0.2
 
 
 # Tables ---------------------------------------------------------------------------------------------------------------
@@ -448,7 +475,7 @@ SHARP = [
 ]
 
 
-@pytest.mark.filterwarnings("ignore:overflow")  # interpreted: trial steps across a layer that are refused
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # interpreted: trial steps across a layer that are refused
 @pytest.mark.parametrize("law", SHARP, ids=str)
 @pytest.mark.parametrize("actuator", ["Force", "BeltSpeed"])
 def test_lanes_next_to_a_layer_and_to_a_switch_of_the_field_give_the_bits_of_single_environments(law, actuator):

@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import event, types
+from numba.core import boxing, event, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
+from numba.core.pythonapi import _boxers
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import NumbaPickler
 
@@ -209,6 +210,23 @@ class _Inner(CPUDispatcher):
     def _compile_for_args(self, *arguments: Any, **named: Any) -> Any:
         return self.py_func  # numba calls it
 
+
+# Results for Python ---------------------------------------------------------------------------------------------------
+
+
+def _box_named_tuple(kind: Any, value: Any, context: Any) -> Any:
+    """Give Python a NamedTuple by C code alone: numba runs Python's code for it, in which Ctrl-C is a crash."""
+    if context.env_manager is None:
+        return boxing.box_namedtuple(kind, value, context)
+    api, constants = context.pyapi, context.env_manager
+    new, of_class = (constants.read_const(constants.add_const(part)) for part in (tuple.__new__, kind.instance_class))
+    parts = boxing.box_tuple(kind, value, context)
+    named = api.call_function_objargs(new, (of_class, parts))
+    api.decref(parts)
+    return named
+
+
+_boxers.functions.update(dict.fromkeys((types.NamedTuple, types.NamedUniTuple), _box_named_tuple))
 
 # Options for numba ----------------------------------------------------------------------------------------------------
 

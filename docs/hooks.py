@@ -23,7 +23,6 @@ from mkdocs.structure.files import File, Files
 import sd_friction_env
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("agents", "sd_friction_env")
 BORROWED = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
 NOTEBOOK = "tour.ipynb"
 
@@ -32,8 +31,8 @@ _ROLE = re.compile(r":(?:attr|class|func|meth|mod):<code>([^<]+)</code>")
 
 def modules() -> list[str]:
     """Return the dotted names of all public modules."""
-    paths = [path for package in PACKAGES for path in sorted((ROOT / package).glob("[!_]*.py"))]
-    return [f"{path.parent.name}.{path.stem}" for path in paths]
+    paths = sorted((ROOT / "sd_friction_env").glob("**/[!_]*.py"))
+    return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
 
 
 @functools.cache

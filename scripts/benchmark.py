@@ -38,7 +38,8 @@ import gymnasium as gym
 import numpy as np
 
 import sd_friction_env
-from sd_friction_env import OscillatorParameters, kernel, limit_cycle, plotting
+from sd_friction_env import OscillatorParameters, kernel, limit_cycle
+from sd_friction_env.pictures import plotting
 from sd_friction_env.storage import atomic_file, checked_ending
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -579,7 +580,7 @@ def sb3(bench: Bench) -> None:
         return
     from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-    from sd_friction_env.sb3 import SDFrictionVecEnv
+    from sd_friction_env.environments.sb3 import SDFrictionVecEnv
 
     def run_of(env: VecEnv, calls: int) -> Slice:
         space = env.action_space
@@ -617,7 +618,7 @@ def ppo(bench: Bench) -> None:
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecEnv
 
-    from sd_friction_env.sb3 import SDFrictionVecEnv
+    from sd_friction_env.environments.sb3 import SDFrictionVecEnv
 
     class Nothing(VecEnv):
         """Hands out the same arrays at every step."""
@@ -786,7 +787,7 @@ def one_cycle(bench: Bench) -> None:
     if importlib.util.find_spec("pytest") is None:
         bench.skip("cycle", "pytest is not installed")
         return
-    from tests import test_peers
+    from tests.scripts import test_peers
 
     ours = limit_cycle(OscillatorParameters())
 

@@ -25,8 +25,8 @@ from gymnasium.vector import AutoresetMode
 
 from scripts.train import Parser
 from sd_friction_env import ENVIRONMENT_IDS
-from sd_friction_env.policies import NetworkPolicy
-from sd_friction_env.wrappers import scaled_reward
+from sd_friction_env.control.policies import NetworkPolicy
+from sd_friction_env.environments.wrappers import scaled_reward
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -234,7 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     mean = f"return {np.mean(returns):.1f} with exploration, over the last {len(returns)} episodes" if returns else ""
     print(f"{told['steps']:,} steps in {told['seconds']:.0f} s. {mean or 'No episode has ended.'}")
     if options.out is not None:
-        print(f"Use it: sd_friction_env.policies.load_policy({str(options.out)!r})")
+        print(f"Use it: sd_friction_env.control.policies.load_policy({str(options.out)!r})")
     return 0
 
 

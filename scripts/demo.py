@@ -17,11 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from agents import evaluation, training
 from scripts import figure_3, figures
-from sd_friction_env import OscillatorParameters, SDFrictionEnv, Table, limit_cycle, plotting, simulate
-from sd_friction_env.policies import Policy, VelocityFeedback, ZeroPolicy
-from sd_friction_env.simulation import Trajectory, amplitude
+from sd_friction_env import OscillatorParameters, SDFrictionEnv, Table, limit_cycle, simulate
+from sd_friction_env.control.policies import Policy, VelocityFeedback, ZeroPolicy
+from sd_friction_env.learning import evaluation, training
+from sd_friction_env.physics.simulation import Trajectory, amplitude
+from sd_friction_env.pictures import plotting
 
 TASKS = {"force": "SDFriction/Force-v0", "belt": "SDFriction/BeltSpeed-v0"}
 VELOCITY_GAINS = {"force": 1.5, "belt": 1.5}  # force: near the best (any gain from 1 to 2); belt: it does harm at any

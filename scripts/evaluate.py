@@ -20,10 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from agents import classical, evaluation, runs
 from scripts.train import TASKS, TIERS, Parser, assignments, environment_id
 from sd_friction_env import ENVIRONMENT_IDS, Table
-from sd_friction_env.policies import ConstantPolicy, Policy, PolicyFileError, VelocityFeedback, ZeroPolicy, load_policy
+from sd_friction_env.control.policies import (
+    ConstantPolicy,
+    Policy,
+    PolicyFileError,
+    VelocityFeedback,
+    ZeroPolicy,
+    load_policy,
+)
+from sd_friction_env.learning import classical, evaluation, runs
 
 CONTROLLERS = ("passive", "velocity-feedback", "constant", "classical")
 # Force: near the best there is. Belt: the belt follows the mass, which makes matters worse at any gain (negative gains

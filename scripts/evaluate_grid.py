@@ -14,11 +14,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from agents import evaluation, grids
 from scripts.evaluate import check_fit, load_agent
 from scripts.train import TASKS, TIERS, Parser, environment_id
-from sd_friction_env import cli, load_pretrained
-from sd_friction_env.policies import Policy, ZeroPolicy
+from sd_friction_env import load_pretrained
+from sd_friction_env.cli import main as cli
+from sd_friction_env.control.policies import Policy, ZeroPolicy
+from sd_friction_env.learning import evaluation, grids
 from sd_friction_env.storage import checked_ending
 
 

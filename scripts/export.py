@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from agents import evaluation, runs
 from scripts.train import TASKS, TIERS, Parser, environment_id
 from sd_friction_env import ENVIRONMENT_IDS, load_pretrained
-from sd_friction_env.policies import NetworkPolicy, load_policy
+from sd_friction_env.control.policies import NetworkPolicy, load_policy
+from sd_friction_env.learning import evaluation, runs
 
 
 def make_parser() -> Parser:
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if getattr(options, option) < low:
             parser.error(f"--{option} must be at least {low}, got {getattr(options, option)}")
     try:
-        from agents import export
+        from sd_friction_env.learning import export
     except ModuleNotFoundError as error:
         parser.error(f'{error.name} is not installed: pip install "sd-friction-env[export]"')
     try:

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from scripts.figures import PANELS, metadata, run, select
-from sd_friction_env import OscillatorParameters, Table, limit_cycle, plotting, simulate
+from sd_friction_env import OscillatorParameters, Table, limit_cycle, simulate
+from sd_friction_env.pictures import plotting
 
 BELT_SPEEDS = (0.05, 0.20, 0.405)
 SAMPLES = 400

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from scripts.figures import PANELS, curve_with_edges, metadata, run, select, stack
-from sd_friction_env import OscillatorParameters, Table, plotting
+from sd_friction_env import OscillatorParameters, Table
+from sd_friction_env.pictures import plotting
 
 ALPHAS = (0.2, 0.5, 0.7, 0.8)
 BELT_SPEEDS = np.linspace(0.0, 0.6, 121)

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from scripts.figures import PANELS, curve_with_edges, metadata, run, select, stack
-from sd_friction_env import OscillatorParameters, Table, plotting
+from sd_friction_env import OscillatorParameters, Table
+from sd_friction_env.pictures import plotting
 
 RATIOS = (0.085, 0.12, 0.18, 0.25)
 BELT_SPEEDS = np.linspace(0.0, 0.45, 91)

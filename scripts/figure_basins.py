@@ -7,7 +7,8 @@ python scripts/figure_basins.py --out elsewhere     into another folder
 from pathlib import Path
 
 from scripts.figures import metadata, run
-from sd_friction_env import OscillatorParameters, Table, basin_grid, plotting
+from sd_friction_env import OscillatorParameters, Table, basin_grid
+from sd_friction_env.pictures import plotting
 
 PLANTS = (OscillatorParameters(alpha=0.2, belt_speed=0.2), OscillatorParameters(alpha=0.5, belt_speed=0.43))
 LIMITS = ((-1.5, 1.5), (-1.0, 1.0))

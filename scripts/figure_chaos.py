@@ -9,8 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from scripts.figures import metadata, run
-from sd_friction_env import OscillatorParameters, Table, plotting, simulate
-from sd_friction_env.forced import bifurcation_diagram, drive_period, forced_basins, lyapunov_exponent, poincare_section
+from sd_friction_env import OscillatorParameters, Table, simulate
+from sd_friction_env.physics.forced import (
+    bifurcation_diagram,
+    drive_period,
+    forced_basins,
+    lyapunov_exponent,
+    poincare_section,
+)
+from sd_friction_env.pictures import plotting
 
 PLANT = OscillatorParameters(alpha=0.6, belt_speed=0.2, force_amplitude=0.28, force_frequency=1.2)
 ON_THE_CHAOS = (1.15, 0.2)  # a start that stays on it

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.optimal import TASKS, OptimalPolicy, Problem
 from scripts.figures import metadata, run, select, stack
-from sd_friction_env import OscillatorParameters, Table, limit_cycle, plotting
+from sd_friction_env import OscillatorParameters, Table, limit_cycle
+from sd_friction_env.learning.optimal import TASKS, OptimalPolicy, Problem
+from sd_friction_env.pictures import plotting
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from scripts.figures import curve_with_edges, metadata, run
-from sd_friction_env import OscillatorParameters, Table, plotting, theory
+from sd_friction_env import OscillatorParameters, Table
+from sd_friction_env.physics import theory
+from sd_friction_env.pictures import plotting
 
 PLANT = OscillatorParameters(geometry="linear")
 

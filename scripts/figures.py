@@ -12,7 +12,7 @@ import numpy as np
 
 import sd_friction_env
 from sd_friction_env import OscillatorParameters, Table, amplitude_curve, critical_belt_speeds
-from sd_friction_env.orbits import rest_place
+from sd_friction_env.physics.orbits import rest_place
 
 PANELS = {"cubic": "as published (cubic, Eq. 9)", "exact": "exact (Eq. 4)"}
 

@@ -10,7 +10,7 @@
 Prints the mean return of every stage beside the value functions' own estimates. On the randomised tier every episode
 has a plant of its own, and the optimum knows it (an upper bound). The sensed tier has the nominal optimum. ``--quick``
 takes one small grid and few starts, to see that it works, and stores nothing unless ``--output`` says where. ``--show``
-prints what is stored and computes nothing. ``--policy`` stores a value function for agents.optimal.OptimalPolicy, which
+prints what is stored and computes nothing. ``--policy`` stores a value function for OptimalPolicy, which
 acts on it. Ctrl-C stops; nothing is then stored.
 """
 
@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from agents import optimal
-from agents.evaluation import EVALUATION_SEEDS, evaluate
 from scripts.train import Parser
+from sd_friction_env.learning import optimal
+from sd_friction_env.learning.evaluation import EVALUATION_SEEDS, evaluate
 
 TIERS = {"nominal": optimal.TASKS, "randomised": optimal.RANDOMISED}
 GRIDS = {

@@ -20,17 +20,10 @@ from scipy.integrate import solve_ivp
 from scripts import figure_3, figure_4, figure_5
 from scripts.figures import PANELS
 from scripts.reference_numbers import Report
-from sd_friction_env import (
-    OscillatorParameters,
-    SDFrictionEnv,
-    attractors,
-    critical_belt_speeds,
-    limit_cycle,
-    simulate,
-)
-from sd_friction_env.basins import basins
-from sd_friction_env.curves import amplitude_curve
-from sd_friction_env.orbits import rest_place
+from sd_friction_env import OscillatorParameters, SDFrictionEnv, attractors, critical_belt_speeds, limit_cycle, simulate
+from sd_friction_env.physics.basins import basins
+from sd_friction_env.physics.curves import amplitude_curve
+from sd_friction_env.physics.orbits import rest_place
 
 NOMINAL = OscillatorParameters()
 ALPHAS = figure_4.ALPHAS

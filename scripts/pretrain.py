@@ -6,7 +6,7 @@
 
 Every run is one of scripts/train.py, in agents/pretrained/TASK-TIER-ALGO-SEED without its checkpoints. Runs that are
 there are kept, unfinished ones resumed: stop with Ctrl-C, start again with the same command. For each task and tier
-the run with the best validation episodes goes to sd_friction_env/pretrained_agents/, with what it did on the evaluation
+the run with the best validation episodes goes to agents/best/, with what it did on the evaluation
 episodes.
 """
 
@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from agents import evaluation, runs
 from scripts.train import TASKS, TIERS, Parser, environment_id
-from sd_friction_env.pretrained import fingerprint, pretrained_file
+from sd_friction_env.control.pretrained import fingerprint, pretrained_file
+from sd_friction_env.learning import evaluation, runs
 
 ROOT = Path(__file__).resolve().parent.parent
 PRETRAINED = ROOT / "agents" / "pretrained"

@@ -22,8 +22,8 @@ from sd_friction_env import (
     kernel,
     limit_cycle,
     simulate,
-    theory,
 )
+from sd_friction_env.physics import theory
 
 EXACT = OscillatorParameters()
 CUBIC = EXACT.replace(geometry="cubic")
@@ -73,7 +73,7 @@ LINEAR_AMPLITUDES = {
 
 # Three of the v_b0 handed down (cubic .4010175566, exact .3988037549, Fig. 5's .0981) lie below the graze: a solver
 # that waits for a change of sign steps over the two crossings of an almost grazing orbit. The roots below are SciPy's,
-# of the greatest v_rel after breakaway (tests/test_orbits.py finds them again).
+# of the greatest v_rel after breakaway (tests/physics/test_orbits.py finds them again).
 CRITICAL = [
     ("cubic .8", CUBIC, "0.4010176647", "0.4363322339"),
     ("exact .8", EXACT, "0.3988125412", "0.4371980496"),

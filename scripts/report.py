@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f'a report needs {" and ".join(missing)}: pip install "sd-friction-env[report]"')
     from tqdm import tqdm
 
-    from agents import classical, report, runs
+    from sd_friction_env.learning import classical, report, runs
 
     begun = time.perf_counter()
     agents: list[report.Agent] = []

@@ -21,8 +21,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
-from agents import runs
 from sd_friction_env import ENVIRONMENT_IDS
+from sd_friction_env.learning import runs
 
 TASKS = {"force": "Force", "belt": "BeltSpeed"}
 TIERS = {"nominal": "", "randomised": "Randomised", "sensed": "Sensed"}
@@ -180,7 +180,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             config = runs.load_unfinished(options.run_folder, force=options.force)
         env_kwargs = assignments("--env-arg", options.env_arg)
         overrides = assignments("--set", options.overrides)
-        from agents import training  # with it comes torch: two seconds
+        from sd_friction_env.learning import training
 
         if by_folder:
             plan = training.plan_of(config)

@@ -20,8 +20,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
-from agents import runs
 from scripts.train import TASKS, TIERS, Parser, assignments, environment_id
+from sd_friction_env.learning import runs
 
 
 def make_parser() -> Parser:
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.top < 1:
         parser.error(f"--top must be a whole number >= 1, got {options.top}")
     try:
-        from agents import tuning  # with it come torch and Optuna: three seconds
+        from sd_friction_env.learning import tuning
     except ModuleNotFoundError as error:
         parser.error(f'{error.name} is not installed: pip install "sd-friction-env[train,tune]"')
     except KeyboardInterrupt:

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 
 from tqdm import tqdm
 
-from agents import classical
 from scripts.train import TASKS, TIERS, Parser, environment_id
+from sd_friction_env.learning import classical
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

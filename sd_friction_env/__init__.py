@@ -9,10 +9,28 @@ from typing import TYPE_CHECKING, Any
 from gymnasium.envs.registration import register
 
 if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out for type checkers
-    from sd_friction_env.basins import Basins, basin_grid
-    from sd_friction_env.curves import amplitude_curve, attractor_curves
-    from sd_friction_env.env import EnvState, SDFrictionEnv
-    from sd_friction_env.orbits import (
+    from sd_friction_env.control import policies
+    from sd_friction_env.control.policies import load_policy
+    from sd_friction_env.control.pretrained import load_pretrained
+    from sd_friction_env.environments.batch import SDFrictionVectorEnv
+    from sd_friction_env.environments.callbacks import AnnealedExploration
+    from sd_friction_env.environments.sb3 import SDFrictionVecEnv
+    from sd_friction_env.environments.single import EnvState, SDFrictionEnv
+    from sd_friction_env.environments.task import Task
+    from sd_friction_env.environments.wrappers import ScaledReward
+    from sd_friction_env.physics import forced, sweeps, theory
+    from sd_friction_env.physics.basins import Basins, basin_grid
+    from sd_friction_env.physics.curves import amplitude_curve, attractor_curves
+    from sd_friction_env.physics.laws import (
+        Asymmetric,
+        check_friction_law,
+        check_spring_law,
+        friction_law,
+        friction_table,
+        spring_law,
+        tabulated_friction,
+    )
+    from sd_friction_env.physics.orbits import (
         ContactLossError,
         CriticalBeltSpeeds,
         Equilibrium,
@@ -26,51 +44,63 @@ if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out f
         slip_cycles,
         stick_intervals,
     )
-    from sd_friction_env.parameters import OscillatorParameters
-    from sd_friction_env.pretrained import load_pretrained
-    from sd_friction_env.simulation import Trajectory, simulate
-    from sd_friction_env.tables import Table
-    from sd_friction_env.task import Task
-    from sd_friction_env.vector_env import SDFrictionVectorEnv
+    from sd_friction_env.physics.parameters import OscillatorParameters
+    from sd_friction_env.physics.rigs import read_rig
+    from sd_friction_env.physics.simulation import Trajectory, simulate
+    from sd_friction_env.physics.tables import Table
+    from sd_friction_env.pictures import plotting
 
 __version__ = "0.1.0"
 
 _PUBLIC = {
-    "OscillatorParameters": "parameters",
-    "Trajectory": "simulation",
-    "simulate": "simulation",
-    "CriticalBeltSpeeds": "orbits",
-    "LimitCycle": "orbits",
-    "Equilibrium": "orbits",
-    "ContactLossError": "orbits",
-    "OrbitError": "orbits",
-    "limit_cycle": "orbits",
-    "equilibria": "orbits",
-    "critical_belt_speeds": "orbits",
-    "attractors": "orbits",
-    "first_lyapunov_coefficient": "orbits",
-    "slip_cycles": "orbits",
-    "stick_intervals": "orbits",
-    "amplitude_curve": "curves",
-    "attractor_curves": "curves",
-    "Basins": "basins",
-    "basin_grid": "basins",
-    "Table": "tables",
-    "Task": "task",
-    "SDFrictionEnv": "env",
-    "EnvState": "env",
-    "SDFrictionVectorEnv": "vector_env",
-    "Asymmetric": "laws",
-    "check_friction_law": "laws",
-    "check_spring_law": "laws",
-    "friction_law": "laws",
-    "friction_table": "laws",
-    "load_pretrained": "pretrained",
-    "spring_law": "laws",
-    "tabulated_friction": "laws",
+    "load_policy": "control.policies",
+    "load_pretrained": "control.pretrained",
+    "SDFrictionVectorEnv": "environments.batch",
+    "AnnealedExploration": "environments.callbacks",
+    "SDFrictionVecEnv": "environments.sb3",
+    "EnvState": "environments.single",
+    "SDFrictionEnv": "environments.single",
+    "Task": "environments.task",
+    "ScaledReward": "environments.wrappers",
+    "Basins": "physics.basins",
+    "basin_grid": "physics.basins",
+    "amplitude_curve": "physics.curves",
+    "attractor_curves": "physics.curves",
+    "Asymmetric": "physics.laws",
+    "check_friction_law": "physics.laws",
+    "check_spring_law": "physics.laws",
+    "friction_law": "physics.laws",
+    "friction_table": "physics.laws",
+    "spring_law": "physics.laws",
+    "tabulated_friction": "physics.laws",
+    "ContactLossError": "physics.orbits",
+    "CriticalBeltSpeeds": "physics.orbits",
+    "Equilibrium": "physics.orbits",
+    "LimitCycle": "physics.orbits",
+    "OrbitError": "physics.orbits",
+    "attractors": "physics.orbits",
+    "critical_belt_speeds": "physics.orbits",
+    "equilibria": "physics.orbits",
+    "first_lyapunov_coefficient": "physics.orbits",
+    "limit_cycle": "physics.orbits",
+    "slip_cycles": "physics.orbits",
+    "stick_intervals": "physics.orbits",
+    "OscillatorParameters": "physics.parameters",
+    "read_rig": "physics.rigs",
+    "Trajectory": "physics.simulation",
+    "simulate": "physics.simulation",
+    "Table": "physics.tables",
+}
+_MODULES = {
+    "forced": "physics.forced",
+    "plotting": "pictures.plotting",
+    "policies": "control.policies",
+    "sweeps": "physics.sweeps",
+    "theory": "physics.theory",
 }
 __all__ = [
     "ENVIRONMENT_IDS",
+    "AnnealedExploration",
     "Asymmetric",
     "Basins",
     "ContactLossError",
@@ -81,7 +111,9 @@ __all__ = [
     "OrbitError",
     "OscillatorParameters",
     "SDFrictionEnv",
+    "SDFrictionVecEnv",
     "SDFrictionVectorEnv",
+    "ScaledReward",
     "Table",
     "Task",
     "Trajectory",
@@ -95,15 +127,22 @@ __all__ = [
     "critical_belt_speeds",
     "equilibria",
     "first_lyapunov_coefficient",
+    "forced",
     "friction_law",
     "friction_table",
     "limit_cycle",
+    "load_policy",
     "load_pretrained",
+    "plotting",
+    "policies",
+    "read_rig",
     "simulate",
     "slip_cycles",
     "spring_law",
     "stick_intervals",
+    "sweeps",
     "tabulated_friction",
+    "theory",
 ]
 
 # Hidden parameters of the randomised tier, and the sensor of the sensed tier.
@@ -118,16 +157,19 @@ for _name, _actuator in _ACTUATORS.items():
     for _tier, _arguments in _TIERS.items():
         register(
             id=f"SDFriction/{_name}{_tier}-v0",
-            entry_point="sd_friction_env.env:SDFrictionEnv",
-            vector_entry_point="sd_friction_env.vector_env:SDFrictionVectorEnv",
+            entry_point="sd_friction_env.environments.single:SDFrictionEnv",
+            vector_entry_point="sd_friction_env.environments.batch:SDFrictionVectorEnv",
             kwargs={"actuator": _actuator, **_arguments},
         )
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _PUBLIC:
+    if name in _MODULES:
+        value: Any = importlib.import_module(f"{__name__}.{_MODULES[name]}")
+    elif name in _PUBLIC:
+        value = getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+    else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)
     globals()[name] = value
     return value
 

@@ -32,6 +32,11 @@ from numpy.typing import NDArray
 
 PathLike = str | os.PathLike[str]
 
+_PACKAGE = Path(__file__).parent
+# Agents, optima, gains and hyperparameters: package data of an installed package, in the repository a folder beside it.
+AGENTS = _PACKAGE / "agents" if (_PACKAGE / "agents").is_dir() else _PACKAGE.parent / "agents"
+HYPERPARAMETERS = AGENTS / "hyperparameters"
+
 LARGEST_ARCHIVE = 2**30  # bytes
 LARGEST_INFLATED = 2**25  # bytes of an archive's compressed entries in all; larger arrays are not compressed
 LARGEST_JSON = 2**20

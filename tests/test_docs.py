@@ -15,11 +15,11 @@ import pytest
 import torch
 
 import sd_friction_env
-from agents import evaluation
 from scripts import cleanrl_ppo
 from sd_friction_env import Task
-from sd_friction_env.policies import load_policy
-from sd_friction_env.wrappers import scaled_reward
+from sd_friction_env.control.policies import load_policy
+from sd_friction_env.environments.wrappers import scaled_reward
+from sd_friction_env.learning import evaluation
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -176,9 +176,9 @@ def test_the_site_loads_nothing_from_elsewhere_and_has_no_dead_link(site):
 
 
 def test_the_api_shows_docstrings_with_links(site):
-    page = (site / "api" / "sd_friction_env.curves.html").read_text(encoding="utf-8")
+    page = (site / "api" / "sd_friction_env.physics.curves.html").read_text(encoding="utf-8")
     assert "Return all attractors at each belt speed" in page
-    assert 'href="#sd_friction_env.curves.amplitude_curve"' in page
+    assert 'href="#sd_friction_env.physics.curves.amplitude_curve"' in page
     for path in site.rglob("*.html"):
         text = path.read_text(encoding="utf-8")
         assert not re.search(r":(attr|class|func|meth|mod):", text), path.name

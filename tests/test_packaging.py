@@ -69,7 +69,7 @@ def test_the_wheel_holds_every_module_and_the_type_marker(wheel_files: set[str])
 def test_the_wheel_holds_the_hyperparameters_of_the_checkout(wheel: Path, wheel_files: set[str]) -> None:
     checkout = {path.name: path.read_bytes() for path in (ROOT / "agents" / "hyperparameters").glob("*.yml")}
     assert checkout
-    prefix = "sd_friction_env/hyperparameters/"
+    prefix = "sd_friction_env/agents/hyperparameters/"
     assert {name.removeprefix(prefix) for name in wheel_files if name.startswith(prefix)} == set(checkout)
     with zipfile.ZipFile(wheel) as archive:
         assert {name: archive.read(prefix + name) for name in checkout} == checkout
@@ -128,7 +128,7 @@ def test_an_installed_wheel_works_without_the_repository(wheel: Path, tmp_path: 
         "print(sd_friction_env.__file__)\n"
         "print(sd_friction_env.__version__)\n"
         "print('SDFriction/Force-v0' in gymnasium.registry)\n"
-        "folder = importlib.resources.files(sd_friction_env) / 'hyperparameters'\n"
+        "folder = importlib.resources.files(sd_friction_env) / 'agents' / 'hyperparameters'\n"
         "print(any(file.name.endswith('.yml') for file in folder.iterdir()))\n"
         "print(len(sd_friction_env.load_pretrained('SDFriction/BeltSpeed-v0').layers))\n"
     )

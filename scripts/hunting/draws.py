@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sd_friction_env import OscillatorParameters, kernel
-from sd_friction_env.parameters import EXCITATIONS, FRICTIONS, GEOMETRIES, RANGES, SMALLEST_ALPHA, STATE_LIMIT
+from sd_friction_env.physics.parameters import EXCITATIONS, FRICTIONS, GEOMETRIES, RANGES, SMALLEST_ALPHA, STATE_LIMIT
 
 NOMINAL = OscillatorParameters()
 LAW_FIELDS = {

@@ -15,8 +15,8 @@ import tests.oracle as oracle
 from scripts.hunting import draws
 from scripts.hunting.trials import Check, Failure, SetAside
 from sd_friction_env import OscillatorParameters, SDFrictionEnv, SDFrictionVectorEnv, kernel
-from sd_friction_env.parameters import RANGES, SMALLEST_ALPHA
-from sd_friction_env.task import RANDOMISABLE
+from sd_friction_env.environments.task import RANDOMISABLE
+from sd_friction_env.physics.parameters import RANGES, SMALLEST_ALPHA
 
 SIZES = (1, 3, 300, 1100)  # of the last two threads take a share each
 STEPS = 7

@@ -9,7 +9,7 @@ import numpy as np
 from scripts.hunting import draws
 from scripts.hunting.trials import Check, Failure, SetAside
 from sd_friction_env import OscillatorParameters, Trajectory, simulate
-from sd_friction_env.simulation import Event
+from sd_friction_env.physics.simulation import Event
 
 END = 5.0
 STEPS = (1.0, 0.1, 0.01)  # times between samples, held against one piece

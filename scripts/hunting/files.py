@@ -29,12 +29,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from agents import classical, optimal, runs, training
 from scripts.train import Parser, assignments
 from sd_friction_env import Table
-from sd_friction_env.policies import NetworkPolicy, load_policy
-from sd_friction_env.storage import read_json, sealed_archive, write_json
-from sd_friction_env.sweeps import Engine, run_chunks
+from sd_friction_env.control.policies import NetworkPolicy, load_policy
+from sd_friction_env.learning import classical, optimal, runs, training
+from sd_friction_env.physics.sweeps import Engine, run_chunks
+from sd_friction_env.storage import HYPERPARAMETERS, read_json, sealed_archive, write_json
 
 FORCE = "SDFriction/Force-v0"
 SECONDS, BYTES = 1.0, 200 * 10**6
@@ -89,9 +89,9 @@ def _readers(base: Path) -> dict[str, tuple[Path, Reader]]:
     for file in optimal.OPTIMUM_DIRECTORY.glob("force*"):
         shutil.copy(file, base / "optimum")
     shutil.copy(classical.GAINS_FILE, base)
-    source = Path(training.__file__).parent / "pretrained" / "force-nominal-ppo-0"
+    source = HYPERPARAMETERS.parent / "pretrained" / "force-nominal-ppo-0"
     shutil.copytree(source, base / "run", dirs_exist_ok=True)
-    shutil.copy(training.HYPERPARAMETERS / "ppo.yml", base)
+    shutil.copy(HYPERPARAMETERS / "ppo.yml", base)
     with contextlib.suppress(ValueError):
         _sweep(base / "sweep" / "sweep.json")
     chunk = next((base / "sweep").glob("chunk-000000-*"))

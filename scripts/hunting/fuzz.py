@@ -14,8 +14,8 @@ import numpy as np
 from scripts.hunting import draws
 from scripts.hunting.trials import Check, Failure
 from sd_friction_env import OscillatorParameters, SDFrictionEnv, SDFrictionVectorEnv, simulate
-from sd_friction_env.parameters import RANGES
-from sd_friction_env.task import Task
+from sd_friction_env.environments.task import Task
+from sd_friction_env.physics.parameters import RANGES
 
 ALLOWED = (TypeError, ValueError, gym.error.Error)
 COMMAND_SECONDS = 30.0

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sd_friction_env import OscillatorParameters, kernel
-from sd_friction_env.basins import LOST_CONTACT, UNDECIDED, Basins, basins
-from sd_friction_env.orbits import equilibria, stick_intervals
+from sd_friction_env.physics.basins import LOST_CONTACT, UNDECIDED, Basins, basins
+from sd_friction_env.physics.orbits import equilibria, stick_intervals
 
 STARTS_OF_A_PLANT = 12
 SAME = 1e-5  # extremes of x, relative to the motion's size

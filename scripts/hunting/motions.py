@@ -9,9 +9,9 @@ import numpy as np
 from scripts.hunting import draws, files, labels
 from scripts.hunting.trials import Check, Failure, SetAside
 from sd_friction_env import OscillatorParameters, attractors, kernel, simulate
-from sd_friction_env.forced import forced_orbit
-from sd_friction_env.orbits import LimitCycle, OrbitError, equilibria
-from sd_friction_env.parameters import STATE_LIMIT
+from sd_friction_env.physics.forced import forced_orbit
+from sd_friction_env.physics.orbits import LimitCycle, OrbitError, equilibria
+from sd_friction_env.physics.parameters import STATE_LIMIT
 
 LAPS = 20
 MOVED = 1e-3  # of a cycle's size

@@ -1,0 +1,1 @@
+"""The oscillator as Gymnasium environments: the task, one environment, the native batch, their adapters."""

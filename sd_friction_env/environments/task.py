@@ -1,0 +1,324 @@
+"""What is asked of a controller: actuator, start, sensing, randomisation and the weights of the reward."""
+
+import dataclasses
+import functools
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Self, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sd_friction_env import kernel
+from sd_friction_env.physics.orbits import LimitCycle, OrbitError, equilibria, limit_cycle, rest_place
+from sd_friction_env.physics.parameters import (
+    EXCITATIONS,
+    RANGES,
+    SMALLEST_ALPHA,
+    STATE_LIMIT,
+    OscillatorParameters,
+    checked_choice,
+    checked_count,
+    checked_number,
+)
+
+Actuator = Literal["force", "belt_speed"]
+Start = Literal["cycle", "rest", "random"]
+Sensor = Literal["state", "position"]
+
+FloatArray: TypeAlias = NDArray[np.float64]
+IntegerArray: TypeAlias = NDArray[np.int64]
+
+RANDOMISABLE = (  # each has its own random numbers, by its place here
+    *("alpha", "g1", "beta", "mu_s", "mu_m", "v_m", "belt_speed", "mu_k", "delta", "v_0", "mu_v", "kappa"),
+    *(f"{kind}_{what}" for kind in EXCITATIONS for what in ("amplitude", "frequency", "phase")),
+    "linear_stiffness",
+)
+
+# Slots of the counter-based generator at step 0 of an episode; sensor noise uses the steps from 1 on.
+PHASE_SLOT, _X_SLOT, _V_SLOT, _PARAMETER_SLOT = 0, 1, 2, 8  # of the random numbers with which an episode begins
+_LAW_SLOT = 1024  # the first of those of laws of one's own
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "force_limit": (0.0, 100.0),
+    "belt_authority": (0.0, 1.0),
+    "belt_acceleration_limit": (0.0, 1e6),
+    "control_interval": (1e-4, 10.0),
+    "w_effort": (0.0, 1e6),
+    "w_stick": (0.0, 1e6),
+    "kick": (-STATE_LIMIT, STATE_LIMIT),
+    "sensor_noise": (0.0, STATE_LIMIT),
+    "contact_loss_cost": (0.0, 1e6),
+    "observation_limit": (1e-3, 1e6),
+}
+EPISODE_STEPS = (1, 10**9)
+_COUNTS: dict[str, tuple[int, int]] = {"episode_steps": EPISODE_STEPS, "sensor_delay": (0, 1000)}
+_SCALES: dict[str, tuple[float, float]] = {"x_offset": (-1e12, 1e12), "x_scale": (1e-9, 1e12), "v_scale": (1e-9, 1e12)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A control task on an oscillator (dimensionless).
+
+    Attributes:
+        actuator: "force" (u = force_limit * action) or "belt_speed" (the belt heads for
+            (1 + belt_authority * action) * belt_speed).
+        force_limit: greatest control force, in [0, 100].
+        belt_authority: greatest relative change of the belt speed asked for, in [0, 1].
+        belt_acceleration_limit: greatest acceleration of the belt, in [0, 1e6].
+        control_interval: time an action is held, in [1e-4, 10].
+        episode_steps: control intervals after which an episode is truncated.
+        w_effort, w_stick: weights of the squared action and of the share of time stuck, in [0, 1e6].
+        start: "cycle" (a random phase of the passive limit cycle; where there is none, the equilibrium with ``kick``),
+            "rest" (at the unloaded spring's place of rest, v = 0) or "random" (x within 3 x_scale of x_offset, v
+            within 4 v_scale of 0).
+        kick: velocity given to a mass that starts at its equilibrium.
+        randomise: parameters drawn evenly from (low, high) at each reset, by name; numbers of a law of your own as
+            ``friction.NAME`` or ``geometry.NAME``.
+        show_parameters: whether the observation ends with the randomised parameters, each scaled to [-1, 1].
+        show_phases: whether the observation holds the cosine and sine of the phase of each excitation (force, ripple,
+            stiffness); without it they are hidden.
+        sensor: "state" (x, v and, with the belt actuator, the belt's modulation) or "position" (x alone).
+        sensor_noise: standard deviation of the noise on x (and v), in [0, 10].
+        sensor_delay: age of what is seen, in control intervals, 0 to 1000.
+        contact_loss_cost: least cost of each step left when contact is lost; the worst cost per step that the episode
+            has seen counts if it is greater.
+        observation_limit: observations are clipped to plus or minus this.
+        x_offset, x_scale, v_scale: observations are (x - x_offset)/x_scale and v/v_scale. None: from the nominal
+            plant's passive motion (equilibrium, half the amplitude, half the belt speed), never from an episode's own
+            parameters, which would give them away.
+
+    Raises:
+        TypeError, ValueError: if a value is not as said, naming it and what is allowed.
+    """
+
+    actuator: Actuator = "force"
+    force_limit: float = 0.05
+    belt_authority: float = 0.5
+    belt_acceleration_limit: float = 0.5
+    control_interval: float = 0.1
+    episode_steps: int = 500
+    w_effort: float = 0.1
+    w_stick: float = 0.5
+    start: Start = "cycle"
+    kick: float = 0.1
+    randomise: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    show_parameters: bool = False
+    show_phases: bool = False
+    sensor: Sensor = "state"
+    sensor_noise: float = 0.0
+    sensor_delay: int = 0
+    contact_loss_cost: float = 10.0
+    observation_limit: float = 10.0
+    x_offset: float | None = None
+    x_scale: float | None = None
+    v_scale: float | None = None
+
+    def __post_init__(self) -> None:
+        checked_choice("actuator", self.actuator, get_args(Actuator))
+        checked_choice("start", self.start, get_args(Start))
+        checked_choice("sensor", self.sensor, get_args(Sensor))
+        for name, (low, high) in _RANGES.items():
+            object.__setattr__(self, name, checked_number(name, getattr(self, name), low, high))
+        for name, (first, last) in _COUNTS.items():
+            object.__setattr__(self, name, checked_count(name, getattr(self, name), first, last))
+        for name, (low, high) in _SCALES.items():
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, checked_number(name, value, low, high))
+        for name in ("show_parameters", "show_phases"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name} must be True or False, got {getattr(self, name)!r}")
+        object.__setattr__(self, "randomise", _checked_randomisation(self.randomise))
+
+    @classmethod
+    def field_names(cls) -> tuple[str, ...]:
+        """Return the names of all arguments."""
+        return tuple(field.name for field in dataclasses.fields(cls))
+
+    @classmethod
+    def from_arguments(cls, arguments: Mapping[str, Any]) -> Self:
+        """Return a task from keyword arguments.
+
+        Raises:
+            TypeError: if a name is unknown.
+        """
+        unknown = sorted(set(arguments) - set(cls.field_names()))
+        if unknown:
+            # Python's own words: by these, clients that try an argument know that there is no such argument.
+            allowed = ", ".join(cls.field_names())
+            raise TypeError(f"__init__() got an unexpected keyword argument {unknown[0]!r}; allowed: {allowed}")
+        return cls(**arguments)
+
+    @property
+    def authority(self) -> float:
+        """What an action of 1 means to the actuator: ``force_limit`` or ``belt_authority``."""
+        return self.force_limit if self.actuator == "force" else self.belt_authority
+
+    @property
+    def late_steps(self) -> int:
+        """Steps before the last quarter of an episode."""
+        return steps_before_last_quarter(self.episode_steps)
+
+    def with_scales(self, nominal: OscillatorParameters) -> Self:
+        """Return the task with the observation scales that were left open taken from the nominal plant's unexcited
+        motion."""
+        if None not in (self.x_offset, self.x_scale, self.v_scale):
+            return self
+        nominal = nominal.unexcited
+        cycle = passive_motion(nominal)
+        places = equilibria(nominal)
+        place = 0.5 * (cycle.x_max + cycle.x_min) if cycle else 0.0
+        if places:
+            place = min((e.x for e in places), key=lambda x: abs(x - place))
+        size = 0.5 * cycle.amplitude if cycle and cycle.amplitude > 1e-3 else 0.25
+        return dataclasses.replace(
+            self,
+            x_offset=place if self.x_offset is None else self.x_offset,
+            x_scale=size if self.x_scale is None else self.x_scale,
+            v_scale=0.5 * nominal.belt_speed if self.v_scale is None else self.v_scale,
+        )
+
+    def draws(self, keys: IntegerArray, episodes: IntegerArray) -> dict[str, FloatArray]:
+        """Return the values drawn for the randomised parameters of n episodes, by name, each (n,).
+
+        Args:
+            keys, episodes: (n,), whole numbers; each episode's values depend on its own two alone.
+        """
+        values = {}
+        for name, (low, high) in self.randomise.items():
+            shares = kernel.random_uniforms(keys, episodes, 0, _slot_of(name))
+            values[name] = low + (high - low) * shares
+        return values
+
+    def phases(self, keys: IntegerArray, episodes: IntegerArray) -> FloatArray:
+        """Return the phases of the passive cycle at which n episodes start, (n,)."""
+        phases: FloatArray = kernel.random_uniforms(keys, episodes, 0, PHASE_SLOT)
+        return phases
+
+    def random_states(self, keys: IntegerArray, episodes: IntegerArray) -> tuple[FloatArray, FloatArray]:
+        """Return the states x and v, each (n,), at which n episodes with the start "random" begin."""
+        assert self.x_offset is not None
+        assert self.x_scale is not None
+        assert self.v_scale is not None
+        x_share = 2.0 * kernel.random_uniforms(keys, episodes, 0, _X_SLOT) - 1.0
+        v_share = 2.0 * kernel.random_uniforms(keys, episodes, 0, _V_SLOT) - 1.0
+        return self.x_offset + 3.0 * self.x_scale * x_share, 4.0 * self.v_scale * v_share
+
+    def drawn_parameters(self, nominal: OscillatorParameters, key: int, episode: int) -> OscillatorParameters:
+        """Return an episode's parameters: the nominal ones with the randomised ones drawn."""
+        if not self.randomise:
+            return nominal
+        drawn = self.draws(np.array([key]), np.array([episode]))
+        return nominal.replace(**{name: float(values[0]) for name, values in drawn.items()})
+
+    def shown_parameters(self, values: Mapping[str, Any]) -> FloatArray:
+        """Return what an observation shows of n episodes' parameters, (p, n), or (p,) if ``values`` are no arrays.
+
+        Args:
+            values: of each parameter, by name, each (n,) or a number.
+        """
+        rows = []
+        for name, (low, high) in self.randomise.items():
+            own = np.asarray(values[name])
+            scaled = 2.0 * (own - low) / (high - low) - 1.0 if high > low else np.zeros_like(own)
+            rows.append(np.clip(scaled, -self.observation_limit, self.observation_limit))
+        return np.array(rows)
+
+    def start_state(self, parameters: OscillatorParameters, key: int, episode: int) -> tuple[float, float]:
+        """Return the (x, v) at which an episode starts."""
+        if self.start == "rest":
+            return rest_place(parameters), 0.0
+        keys, episodes = np.array([key]), np.array([episode])
+        if self.start == "random":
+            x, v = self.random_states(keys, episodes)
+            return float(x[0]), float(v[0])
+        return self.cycle_state(parameters, float(self.phases(keys, episodes)[0]))
+
+    def cycle_state(self, parameters: OscillatorParameters, phase: float) -> tuple[float, float]:
+        """Return the passive, unexcited cycle's state at a phase in [0, 1], or the kicked equilibrium where nothing
+        oscillates."""
+        parameters = parameters.unexcited
+        cycle = passive_motion(parameters)
+        if cycle is None:
+            places = equilibria(parameters)
+            return (places[-1].x if places else rest_place(parameters)), self.kick
+        if cycle.amplitude == 0.0:
+            return cycle.x_phase0, self.kick
+        return cycle.state(phase)
+
+
+def _slot_of(name: str) -> int:
+    """Return the slot of the random numbers that draw a parameter."""
+    if name in RANDOMISABLE:
+        return _PARAMETER_SLOT + RANDOMISABLE.index(name)
+    return _LAW_SLOT + zlib.crc32(name.encode())
+
+
+def steps_before_last_quarter(episode_steps: int) -> int:
+    """Return how many of an episode's steps come before its last quarter."""
+    return episode_steps - max(1, episode_steps // 4)
+
+
+def _checked_randomisation(randomise: Any) -> dict[str, tuple[float, float]]:
+    if not isinstance(randomise, Mapping):
+        raise TypeError(f"randomise must map parameter names to (low, high), got {randomise!r}")
+    checked = {}
+    for name, interval in randomise.items():
+        of_own_law = isinstance(name, str) and name.startswith(("friction.", "geometry."))
+        if name not in RANDOMISABLE and not of_own_law:
+            allowed = f"{', '.join(RANDOMISABLE)}, and friction.NAME or geometry.NAME of a law of your own"
+            raise ValueError(f"randomise has no parameter {name!r}; allowed: {allowed}")
+        try:
+            low, high = interval
+        except (TypeError, ValueError):
+            raise ValueError(f"randomise[{name!r}] must be a pair (low, high), got {interval!r}") from None
+        range_of = RANGES.get(name, (-1e12, 1e12))
+        low = checked_number(f"randomise[{name!r}] low", low, *range_of)
+        high = checked_number(f"randomise[{name!r}] high", high, *range_of)
+        if low > high:
+            raise ValueError(f"randomise[{name!r}] must have low <= high, got {interval!r}")
+        if name == "alpha" and low < SMALLEST_ALPHA and high > 0.0:
+            raise ValueError(
+                f"randomise['alpha'] low must be at least {SMALLEST_ALPHA:g} where alpha varies, got {low!r}"
+            )
+        checked[name] = (low, high)
+    return dict(sorted(checked.items()))
+
+
+@functools.lru_cache(maxsize=4096)
+def passive_motion(parameters: OscillatorParameters) -> LimitCycle | None:
+    """Return the attractor of a mass set down at x = 0 with the belt, without excitation; None if it loses contact or
+    does not settle."""
+    try:
+        return limit_cycle(parameters.unexcited)
+    except OrbitError:
+        return None
+
+
+def rig_arguments(
+    parameters: OscillatorParameters,
+    *,
+    sampling_time: float,
+    force_limit: float | None = None,
+    belt_acceleration_limit: float | None = None,
+) -> dict[str, Any]:
+    """Return task arguments for a rig whose controller works in SI units.
+
+    Args:
+        parameters: of the rig, made by :meth:`OscillatorParameters.from_physical`.
+        sampling_time: of the controller, s. force_limit: greatest control force, N.
+        belt_acceleration_limit: of the belt, m/s^2.
+
+    Returns:
+        ``control_interval`` and, where given, ``force_limit`` and ``belt_acceleration_limit``, dimensionless.
+    """
+    arguments = {"control_interval": checked_number("sampling_time", sampling_time, 0.0, 1e9) / parameters.time_scale}
+    if force_limit is not None:
+        arguments["force_limit"] = checked_number("force_limit", force_limit, 0.0, 1e18) / parameters.force_scale
+    if belt_acceleration_limit is not None:
+        scale = parameters.length_scale / (parameters.time_scale * parameters.time_scale)
+        limit = checked_number("belt_acceleration_limit", belt_acceleration_limit, 0.0, 1e18)
+        arguments["belt_acceleration_limit"] = limit / scale
+    return arguments

@@ -1,0 +1,1 @@
+"""What trains and judges controllers: training, tuning, evaluation, optimal control, export, the report."""

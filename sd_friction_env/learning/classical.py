@@ -1,0 +1,454 @@
+"""Classical controllers, each tuned on a task's own objective, and kept with the command that tuned them.
+
+The objective is the mean return over the validation episodes: what the agents are trained for, and never the episodes
+of the report. It may prefer a controller that runs the belt slow to one that suppresses the vibration; the share of
+suppressed episodes is kept beside it.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import scipy
+import scipy.linalg
+import scipy.optimize
+from numpy.typing import ArrayLike, NDArray
+
+import sd_friction_env
+from sd_friction_env import ENVIRONMENT_IDS, SDFrictionEnv
+from sd_friction_env.control.policies import (
+    Actions,
+    DelayedFeedback,
+    FilteredFeedback,
+    LinearFeedback,
+    Policy,
+    Readings,
+    SlidingMode,
+    State,
+    VelocityFeedback,
+)
+from sd_friction_env.learning import evaluation
+from sd_friction_env.storage import AGENTS, locked, predecessor_hint, read_json, write_json
+
+GAINS_FILE = AGENTS / "classical.json"
+TUNING_SEEDS = evaluation.VALIDATION_SEEDS[:32]
+
+_DIFFERENCE = 1e-5
+_AT_ONCE = 32  # controllers side by side: more are no faster, and want more memory
+_AT_BOUND = 0.01  # of a range: from there on a value counts as at its bound
+
+
+class NotTunedError(ValueError):
+    """No tuned controllers are stored for an environment."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """Where a value is looked for, and on what scale.
+
+    Attributes:
+        low, high: its bounds.
+        unit: None: as it is; else on a symmetric logarithm, asinh(value/unit), which is even in the order of magnitude
+            from the unit on, so that the bounds may stand far outside of what is wanted.
+        low_is, high_is: what a controller at that bound is, where the bound is no mere end of the search.
+    """
+
+    low: float
+    high: float
+    unit: float | None = None
+    low_is: str = ""
+    high_is: str = ""
+
+    def to_scale(self, value: float) -> float:
+        """Return a value as it is searched."""
+        return value if self.unit is None else math.asinh(value / self.unit)
+
+    def from_scale(self, searched: float) -> float:
+        """Return the value of what is searched, within the bounds to the bit."""
+        value = searched if self.unit is None else self.unit * math.sinh(searched)
+        return min(max(value, self.low), self.high)
+
+    def bound_at(self, value: float) -> str | None:
+        """Return "low" or "high" if the value lies within 1% of the range from that bound on the scale of the search,
+        else None."""
+        low, place, high = (self.to_scale(number) for number in (self.low, value, self.high))
+        near = _AT_BOUND * (high - low)
+        return "low" if place < low + near else "high" if place > high - near else None
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of controller and what is tuned of it.
+
+    Attributes:
+        build: makes it from an environment and the tuned values, in the order of ``ranges``.
+        ranges: of each value, by name.
+        needs_velocity: whether it needs the sensor "state" (else: it is for the sensors that see x alone, or all).
+        everywhere: whether it is for both kinds of sensors.
+    """
+
+    build: Callable[[SDFrictionEnv, Sequence[float]], Policy]
+    ranges: Callable[[SDFrictionEnv], dict[str, Range]]
+    needs_velocity: bool = True
+    everywhere: bool = False
+
+
+def _linear(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    return LinearFeedback.from_env(env, values[:-1], values[-1])
+
+
+def _velocity(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    return VelocityFeedback.from_env(env, values[0])
+
+
+def _lqr(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    return LinearFeedback.from_env(env, lqr_gains(env, *(10.0**value for value in values)))
+
+
+def _filtered(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    return FilteredFeedback.from_env(env, x_gain=values[0], v_gain=values[1], pole=values[2], bias=values[3])
+
+
+def _filtered_sliding(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    slope, layer, pole, amplitude = values
+    steep = -np.sign(amplitude) / 10.0**layer
+    return FilteredFeedback.from_env(env, x_gain=steep * slope, v_gain=steep, pole=pole, amplitude=abs(amplitude))
+
+
+def _delayed(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    return DelayedFeedback.from_env(env, gain=values[0], delay=max(1, round(values[1])))
+
+
+def _sliding(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    slope, layer, amplitude = values
+    return SlidingMode.from_env(env, slope=slope, layer=10.0**layer, amplitude=amplitude)
+
+
+def _gain(unit: float) -> Range:
+    """Return the range of a gain; the unit is what turns an observation of 1 into an action of 1. Feedback is a mere
+    switch long before 1e4 of it."""
+    return Range(-1e4 * unit, 1e4 * unit, unit)
+
+
+def _x_gain(env: SDFrictionEnv) -> Range:
+    return _gain(1.0 / Readings.from_env(env).x_scale)
+
+
+def _v_gain(env: SDFrictionEnv) -> Range:
+    return _gain(1.0 / Readings.from_env(env).v_scale)
+
+
+def _velocity_gain(env: SDFrictionEnv) -> Range:
+    return _gain(Readings.from_env(env).authority / Readings.from_env(env).v_scale)
+
+
+def _linear_ranges(env: SDFrictionEnv) -> dict[str, Range]:
+    gains = (_x_gain(env), _v_gain(env), _BIAS)  # the last for the belt, where it moves
+    return {**dict(zip(Readings.from_env(env).names, gains, strict=False)), "bias": _BIAS}
+
+
+def _slope(env: SDFrictionEnv) -> Range:
+    unit = Readings.from_env(env).v_scale / Readings.from_env(env).x_scale
+    return Range(-100.0 * unit, 100.0 * unit, unit)
+
+
+_BIAS = _gain(1.0)
+_LAYER = Range(-5.0, 2.0, low_is="a switch", high_is="hardly any feedback")
+_POLE = Range(0.0, 0.99, low_is="no smoothing")
+_AMPLITUDE = Range(-1.0, 1.0, low_is="all that the actuator gives", high_is="all that the actuator gives")
+_DELAY = Range(1.0, 100.0, low_is="the shortest delay there is")
+_WEIGHT = Range(-8.0, 8.0)
+KINDS: dict[str, Kind] = {
+    "velocity feedback": Kind(_velocity, lambda env: {"gain": _velocity_gain(env)}),
+    "linear state feedback": Kind(_linear, _linear_ranges),
+    "LQR": Kind(_lqr, lambda env: {"log10 weight of x": _WEIGHT, "log10 weight of the action": _WEIGHT}),
+    "sliding mode": Kind(_sliding, lambda env: {"slope": _slope(env), "log10 layer": _LAYER, "amplitude": _AMPLITUDE}),
+    "delayed displacement feedback": Kind(
+        _delayed, lambda env: {"gain": _x_gain(env), "delay": _DELAY}, needs_velocity=False, everywhere=True
+    ),
+    "linear feedback, velocity estimated": Kind(
+        _filtered,
+        lambda env: {"x gain": _x_gain(env), "v gain": _v_gain(env), "pole": _POLE, "bias": _BIAS},
+        needs_velocity=False,
+    ),
+    "sliding mode, velocity estimated": Kind(
+        _filtered_sliding,
+        lambda env: {"slope": _slope(env), "log10 layer": _LAYER, "pole": _POLE, "amplitude": _AMPLITUDE},
+        needs_velocity=False,
+    ),
+}
+
+
+def kinds_for(env_id: str) -> list[str]:
+    """Return the names of the controllers that an environment's sensor allows."""
+    sees = evaluation.make_env(env_id).task.sensor == "state"
+    return [name for name, kind in KINDS.items() if kind.everywhere or kind.needs_velocity == sees]
+
+
+# LQR ------------------------------------------------------------------------------------------------------------------
+
+
+def linearised(env: SDFrictionEnv) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return A, shape (k, k), and B, shape (k, 1), of the nominal plant's step about its steady-slip equilibrium.
+
+    The state is what a controller reads (see ``Readings.names``); differences of the environment's own step, so that
+    the hold over an interval and the belt's inertia are in them.
+    """
+    readings = Readings.from_env(env)
+    k = len(readings.names)
+    speed, plant = env.nominal.belt_speed, dataclasses.asdict(env.nominal)
+
+    def step(deviation: NDArray[np.float64], action: float) -> NDArray[np.float64]:
+        start = {"x": readings.x_equilibrium + deviation[0], "v": deviation[1]}
+        env.reset(seed=0, options=start | {"parameters": plant})
+        if k == 3:
+            env.set_state(dataclasses.replace(env.get_state(), v_belt=speed + readings.authority * deviation[2]))
+        _, _, _, _, info = env.step(np.array([action]))
+        end = [info["x"] - readings.x_equilibrium, info["v"], (info["v_belt"] - speed) / readings.authority]
+        return np.array(end[:k])
+
+    h = _DIFFERENCE
+    a = np.stack([(step(h * e, 0.0) - step(-h * e, 0.0)) / (2.0 * h) for e in np.eye(k)], axis=1)
+    # The action is float32 in use, not here.
+    b = (step(np.zeros(k), h) - step(np.zeros(k), -h)) / (2.0 * h)
+    return a, b[:, None]
+
+
+def lqr_gains(env: SDFrictionEnv, x_weight: float, action_weight: float) -> tuple[float, ...]:
+    """Return the gains of the linear-quadratic regulator at the nominal plant's steady-slip equilibrium.
+
+    The cost of a step is that of the task, v^2/v_b^2 + action_weight w_effort a^2, and x_weight x^2.
+
+    Raises:
+        ValueError: if the sensor does not see the velocity.
+    """
+    if not Readings.from_env(env).sees_velocity:
+        raise ValueError("LQR needs the velocity, and this environment's sensor sees the position only")
+    a, b = linearised(env)
+    q = np.diag([x_weight, 1.0 / env.nominal.belt_speed**2, 0.0][: len(a)])
+    r = np.array([[action_weight * max(env.task.w_effort, 1e-6)]])
+    p = scipy.linalg.solve_discrete_are(a, b, q, r)
+    gains = -np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
+    return tuple(gains[0].tolist())
+
+
+# Tuning ---------------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _nominal_env(env_id: str) -> SDFrictionEnv:
+    return evaluation.make_env(env_id)
+
+
+def build(name: str, env_id: str, values: Sequence[float]) -> Policy:
+    """Return a controller with the values that :func:`tune` tunes."""
+    return KINDS[name].build(_nominal_env(env_id), values)
+
+
+@dataclass(frozen=True)
+class _SideBySide:
+    """Several controllers, each with as many of the observations, in order."""
+
+    controllers: Sequence[Policy]
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, State]:
+        """Return the actions of all, and what they remember."""
+        count = len(self.controllers)
+        seen = np.split(np.asarray(observation), count)
+        starts = np.split(np.broadcast_to(np.asarray(episode_start, dtype=bool), (len(seen[0]) * count,)), count)
+        states = [None] * count if state is None else cast(Any, state)
+        told = [
+            controller.predict(what, before, begun, deterministic)
+            for controller, what, before, begun in zip(self.controllers, seen, states, starts, strict=True)
+        ]
+        return np.concatenate([actions for actions, _ in told]), cast(Any, tuple(state for _, state in told))
+
+
+def _mean_returns(controllers: Sequence[Policy], env_id: str) -> NDArray[np.float64]:
+    """Return the mean return of each over the episodes that tuning sees, all side by side."""
+    seeds = list(TUNING_SEEDS) * len(controllers)
+    episodes = evaluation.run_episodes(_SideBySide(controllers), env_id, seeds)
+    means: NDArray[np.float64] = np.nansum(episodes.reward, axis=1).reshape(-1, len(TUNING_SEEDS)).mean(axis=1)
+    return means
+
+
+def tune(
+    name: str,
+    env_id: str,
+    *,
+    seed: int = 0,
+    generations: int = 50,
+    population: int = 12,
+    progress: Callable[[float, float], None] = lambda best, share: None,
+) -> dict[str, Any]:
+    """Return the best values of a controller that differential evolution finds, and what they came to.
+
+    Args:
+        name: in ``kinds_for(env_id)``. seed: of the search. generations, population: of SciPy's
+            ``differential_evolution``, the population per tuned value.
+        progress: told the best mean return so far and the share of the generations done.
+    """
+    ranges = KINDS[name].ranges(_nominal_env(env_id))
+    best = -np.inf
+    done = evaluations = 0
+
+    def values_of(searched: NDArray[np.float64]) -> list[float]:
+        return [way.from_scale(place) for way, place in zip(ranges.values(), searched.tolist(), strict=True)]
+
+    def costs(searched: Any) -> Any:
+        nonlocal best, evaluations
+        evaluations += searched.shape[1]
+        found = np.full(searched.shape[1], np.inf)
+        controllers = {}
+        for i, places in enumerate(searched.T):
+            with contextlib.suppress(np.linalg.LinAlgError):  # no regulator for such weights
+                controllers[i] = build(name, env_id, values_of(places))
+        made = list(controllers)
+        for some in (made[first : first + _AT_ONCE] for first in range(0, len(made), _AT_ONCE)):
+            found[some] = -_mean_returns([controllers[i] for i in some], env_id)
+        best = max(best, -float(found.min()))
+        return found
+
+    def told(*_: Any) -> None:
+        nonlocal done
+        done += 1
+        progress(best, done / generations)
+
+    found = scipy.optimize.differential_evolution(
+        costs,
+        scipy.optimize.Bounds(
+            [way.to_scale(way.low) for way in ranges.values()], [way.to_scale(way.high) for way in ranges.values()]
+        ),
+        maxiter=generations,
+        popsize=population,
+        rng=seed,
+        tol=1e-6,
+        polish=False,
+        vectorized=True,
+        updating="deferred",
+        callback=told,
+    )
+    values = dict(zip(ranges, values_of(found.x), strict=True))
+    return {
+        "values": values,
+        **measured(name, env_id, values),
+        "at_bound": at_bound(name, env_id, values),
+        "seed": seed,
+        "evaluations": evaluations,
+        "versions": versions(),
+    }
+
+
+def measured(name: str, env_id: str, values: Mapping[str, float]) -> dict[str, float]:
+    """Return what a controller with such values comes to in the validation episodes."""
+    table = evaluation.evaluate(_with(name, env_id, values), env_id, evaluation.VALIDATION_SEEDS)
+    return {
+        "tuning_return": float(table["return"][: len(TUNING_SEEDS)].mean()),  # those come first
+        "validation_return": float(table["return"].mean()),
+        "suppressed": float(table["suppressed"].mean()),
+    }
+
+
+def at_bound(name: str, env_id: str, values: Mapping[str, float]) -> dict[str, str]:
+    """Return the values that lie at a bound of the search, each with what such a controller is ("" if the bound is the
+    mere end of the search, and wider bounds may find a better one)."""
+    found = {}
+    for key, way in KINDS[name].ranges(_nominal_env(env_id)).items():
+        bound = way.bound_at(values[key])
+        if bound is not None:
+            found[key] = way.low_is if bound == "low" else way.high_is
+    return found
+
+
+def _with(name: str, env_id: str, values: Mapping[str, float]) -> Policy:
+    return build(name, env_id, [values[key] for key in KINDS[name].ranges(_nominal_env(env_id))])
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what tunes."""
+    return {"sd_friction_env": sd_friction_env.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
+
+
+def stored_gains(path: Path | None = None) -> dict[str, dict[str, Any]]:
+    """Return what is stored: by environment id and controller, what :func:`tune` returned and the command.
+
+    Args:
+        path: of the file; None: the one that comes with the project.
+
+    Raises:
+        ValueError: if the file is not one of ours.
+    """
+    path = GAINS_FILE if path is None else path
+    if not path.exists():
+        return {}
+    try:
+        gains: dict[str, dict[str, Any]] = read_json(path)["gains"]
+        for env_id, controllers in gains.items():
+            for name, found in controllers.items():
+                if env_id not in ENVIRONMENT_IDS or name not in KINDS:
+                    raise ValueError(f"{env_id}: {name}")
+                if set(found["values"]) != set(KINDS[name].ranges(_nominal_env(env_id))):
+                    raise ValueError(f"{env_id}: {name}: {sorted(found['values'])}")
+                _with(name, env_id, found["values"])
+    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{str(path)!r} does not hold gains of classical controllers ({error}){predecessor_hint(path)}"
+        ) from None
+    return gains
+
+
+def keep(env_id: str, name: str, found: Mapping[str, Any], path: Path | None = None) -> dict[str, Any]:
+    """Store what :func:`tune` found unless what is stored does better in the environment as it is now; return what is
+    stored then.
+
+    Whatever else is stored stays as it is, whoever stores at the same time; the file is written whole or not at all,
+    and its predecessor is kept as "NAME.previous".
+
+    Args:
+        env_id, name: of the environment and the controller. found: of :func:`tune`, with the command.
+        path: of the gains, as :func:`stored_gains` takes it.
+
+    Raises:
+        ValueError: if the file is not one of ours. OSError: if it cannot be written.
+    """
+    path = GAINS_FILE if path is None else path
+    with locked(path.with_name(f".{path.name}.lock"), repr(str(path)), wait=True):
+        gains = stored_gains(path)
+        before = gains.get(env_id, {}).get(name)
+        kept = dict(found)
+        if before is not None:
+            # Measured again: the environment may have changed since.
+            again = measured(name, env_id, before["values"])
+            if again["validation_return"] > found["validation_return"]:
+                kept = {**before, **again, "at_bound": at_bound(name, env_id, before["values"])}
+        gains.setdefault(env_id, {})[name] = kept
+        write_json(path, {"gains": gains}, indent=1, keep=True)
+    return kept
+
+
+def classical_controllers(env_id: str, path: Path | None = None) -> dict[str, Policy]:
+    """Return the tuned controllers of an environment by name.
+
+    Args:
+        env_id: its id. path: of the gains, as :func:`stored_gains` takes it.
+
+    Raises:
+        NotTunedError: if none is stored for it. ValueError: if the file is not one of ours.
+    """
+    env_id = env_id.rpartition(":")[2]
+    found = stored_gains(path).get(env_id)
+    if not found:
+        raise NotTunedError(f"no tuned controllers are stored for {env_id!r}: run scripts/tune_classical.py")
+    return {name: _with(name, env_id, entry["values"]) for name, entry in found.items()}

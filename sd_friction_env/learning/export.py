@@ -1,0 +1,283 @@
+"""Trained agents as ONNX: from what is measured to what is commanded, with nothing of ours needed to run it.
+
+The graph takes physical measurements (dimensionless), scales and clips them as the environment does, runs the network
+in double precision, and gives the action in [-1, 1] and the command that it stands for.
+"""
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+import sd_friction_env
+from sd_friction_env import SDFrictionEnv
+from sd_friction_env.control.policies import NetworkPolicy
+from sd_friction_env.learning import evaluation
+from sd_friction_env.storage import atomic_file
+
+OPSET = 17
+TOLERANCE = 1e-6
+MEASUREMENTS, ACTION, COMMAND = "measurements", "action", "command"
+_OPERATORS = {"Tanh": "Tanh", "ReLU": "Relu"}
+_IR_VERSION = 8  # the oldest that holds this opset: runtimes of 2022 read it
+
+Measurements = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Interface:
+    """What a controller measures and commands, all dimensionless.
+
+    Where the plant's own belt speed is drawn anew for each episode, no constant tells what the belt's speed means: it
+    is then measured and commanded in units of the plant's nominal one (``v_belt/belt_speed``), which its operator sets.
+
+    Attributes:
+        names: of the measurements, in order. rest: what they are where all observations are zero; it fills the window
+            of an episode that is younger than the window.
+        offsets, scales: the observation of a measurement m is (m - offset)/scale, clipped to [-limit, limit].
+        command: name of what is commanded. command_offset, command_scale: it is offset + scale x action.
+    """
+
+    names: tuple[str, ...]
+    rest: tuple[float, ...]
+    offsets: tuple[float, ...]
+    scales: tuple[float, ...]
+    limit: float
+    command: str
+    command_offset: float
+    command_scale: float
+
+    @classmethod
+    def of(cls, env: SDFrictionEnv) -> "Interface":
+        """Return that of an environment.
+
+        Raises:
+            ValueError: if it shows parameters, which nobody can measure.
+        """
+        task, speed = env.task, env.nominal.belt_speed
+        if task.show_parameters:
+            raise ValueError("an agent that is shown parameters cannot be exported: they are no measurements")
+        assert task.x_offset is not None  # filled in by the environment, as the other scales are
+        assert task.x_scale is not None
+        assert task.v_scale is not None
+        names, offsets, scales = ["x"], [task.x_offset], [task.x_scale]
+        by_force, relative = task.actuator == "force", "belt_speed" in task.randomise
+        unit = 1.0 if relative else speed
+        if task.sensor == "state":
+            names, offsets, scales = [*names, "v"], [*offsets, 0.0], [*scales, task.v_scale]
+            if not by_force:
+                names = [*names, "v_belt/belt_speed" if relative else "v_belt"]
+                offsets, scales = [*offsets, unit], [*scales, task.belt_authority * unit]
+        return cls(
+            names=tuple(names),
+            rest=tuple(offsets),
+            offsets=tuple(offsets),
+            scales=tuple(scales),
+            limit=task.observation_limit,
+            command="force" if by_force else "target of the belt's speed" + relative * ", over its nominal speed",
+            command_offset=0.0 if by_force else unit,
+            command_scale=task.force_limit if by_force else task.belt_authority * unit,
+        )
+
+    def measure(self, env: SDFrictionEnv, info: dict[str, Any]) -> NDArray[np.float64]:
+        """Return the true measurements, shape (k,), in an environment that has just returned ``info``."""
+        known = {**info, "v_belt/belt_speed": info["v_belt"] / env.parameters.belt_speed}
+        return np.array([known[name] for name in self.names])
+
+    def observe(self, measurements: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the observations that the environment would show, for measurements of shape (..., k)."""
+        values = (np.asarray(measurements, np.float64) - np.array(self.offsets)) / np.array(self.scales)
+        return np.asarray(np.clip(values, -self.limit, self.limit), dtype=np.float32)
+
+
+def build(policy: NetworkPolicy, env: SDFrictionEnv, about: dict[str, Any] | None = None) -> onnx.ModelProto:
+    """Return the ONNX model of an agent.
+
+    Input ``measurements``: float32, shape (n, frames, k), oldest first. Outputs ``action`` and ``command``: float32,
+    shape (n, 1). ``metadata_props`` say what the columns are, how often it is to be asked, and what fills a young
+    window.
+
+    Args:
+        policy: of the agent. env: that it controls. about: more for the metadata (JSON values).
+
+    Raises:
+        ValueError: if the agent does not fit the environment.
+    """
+    interface = Interface.of(env)
+    k = len(interface.names)
+    if policy.observation_size != k:
+        raise ValueError(f"the agent observes {policy.observation_size} values, and the environment gives {k}")
+    constants: dict[str, NDArray[Any]] = {
+        "offsets": np.array(interface.offsets),
+        "scales": np.array(interface.scales),
+        "low": np.array(-interface.limit),
+        "high": np.array(interface.limit),
+        "flat": np.array([-1, policy.frames * k], np.int64),
+        "minus_one": np.array(-1.0),
+        "one": np.array(1.0),
+        "command_offset": np.array(interface.command_offset),
+        "command_scale": np.array(interface.command_scale),
+    }
+    nodes = []
+
+    def add(operator: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
+        nodes.append(helper.make_node(operator, inputs, [output], **attributes))
+        return output
+
+    double = add("Cast", [MEASUREMENTS], "double", to=TensorProto.DOUBLE)
+    scaled = add("Div", [add("Sub", [double, "offsets"], "shifted"), "scales"], "scaled")
+    clipped = add("Clip", [scaled, "low", "high"], "clipped")
+    # Agents have seen observations in single precision.
+    single = add("Cast", [clipped], "observations", to=TensorProto.FLOAT)
+    hidden = add("Reshape", [add("Cast", [single], "observed", to=TensorProto.DOUBLE), "flat"], "window")
+    for i, (weights, bias) in enumerate(policy.layers):
+        constants |= {f"weights_{i}": weights, f"bias_{i}": bias}
+        product = add("MatMul", [hidden, f"weights_{i}"], f"product_{i}")
+        hidden = add("Add", [product, f"bias_{i}"], f"sum_{i}")
+        if i + 1 < len(policy.layers):
+            hidden = add(_OPERATORS[policy.activation], [hidden], f"hidden_{i}")
+    if policy.output == "clip":
+        hidden = add("Clip", [hidden, "minus_one", "one"], "bounded")
+    else:
+        hidden = add("Tanh", [hidden], "bounded")
+    add("Cast", [hidden], ACTION, to=TensorProto.FLOAT)
+    # What is commanded follows from the action as it is given out.
+    given = add("Cast", [ACTION], "given", to=TensorProto.DOUBLE)
+    command = add("Add", [add("Mul", [given, "command_scale"], "change"), "command_offset"], "commanded")
+    add("Cast", [command], COMMAND, to=TensorProto.FLOAT)
+    graph = helper.make_graph(
+        nodes,
+        "agent",
+        [helper.make_tensor_value_info(MEASUREMENTS, TensorProto.FLOAT, ["n", policy.frames, k])],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", 1]) for name in (ACTION, COMMAND)],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(
+        graph,
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=_IR_VERSION,
+        producer_name="sd_friction_env",
+        producer_version=sd_friction_env.__version__,
+    )
+    said = {
+        "units": "dimensionless: lengths over the spring's free length, times times its frequency",
+        "measurements": list(interface.names),
+        "window": f"the last {policy.frames} measurements, one for each control interval, oldest first",
+        "young_window_is_filled_with": list(interface.rest),
+        "control_interval": env.task.control_interval,
+        "sensor": env.task.sensor,
+        "command": interface.command,
+        **(about or {}),
+    }
+    helper.set_model_props(
+        model, {name: value if isinstance(value, str) else json.dumps(value) for name, value in said.items()}
+    )
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def session(model: onnx.ModelProto | Path) -> onnxruntime.InferenceSession:
+    """Return a session of onnxruntime on one thread."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    source = str(model) if isinstance(model, Path) else model.SerializeToString()
+    return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+
+
+def trial_measurements(policy: NetworkPolicy, env_id: str, n: int, seed: int = 0) -> Measurements:
+    """Return windows of measurements, shape (n, frames, k): half from episodes that the agent controls, with the young
+    windows of their beginnings, half random over more than what an observation can show."""
+    env = evaluation.make_env(env_id)
+    interface, rng = Interface.of(env), np.random.default_rng(seed)
+    k, frames = len(interface.names), policy.frames
+    driven: list[Measurements] = []
+    while len(driven) < n // 2:
+        observation, info = env.reset(seed=int(rng.integers(2**31)))
+        window = np.tile(np.array(interface.rest, np.float32), (frames, 1))
+        state, begins, over = None, True, False
+        while not over and len(driven) < n // 2:
+            measured = observation[:k] * np.array(interface.scales) + np.array(interface.offsets)
+            window = np.concatenate([window[1:], measured[None].astype(np.float32)])
+            driven.append(window)
+            action, state = policy.predict(observation, state, begins)
+            observation, _, terminated, truncated, info = env.step(action)
+            begins, over = False, terminated or truncated
+    spread = 1.2 * interface.limit * np.array(interface.scales)
+    random = rng.uniform(-1.0, 1.0, (n - len(driven), frames, k)) * spread + np.array(interface.offsets)
+    # A clipped observation is seldom; most are near what is usual.
+    random[::2] = (random[::2] - np.array(interface.offsets)) / interface.limit + np.array(interface.offsets)
+    return np.concatenate([np.array(driven, np.float32).reshape(-1, frames, k), random.astype(np.float32)])
+
+
+def worst_difference(model: onnx.ModelProto, policy: NetworkPolicy, env_id: str, measurements: Measurements) -> float:
+    """Return the largest difference between the model's actions and the agent's on the observations of measurements."""
+    interface = Interface.of(evaluation.make_env(env_id))
+    (actions,) = session(model).run([ACTION], {MEASUREMENTS: measurements})
+    windows = interface.observe(measurements)
+    state = None
+    for frame in range(policy.frames):  # shown one after the other, as an episode does
+        expected, state = policy.predict(windows[:, frame], state, np.full(len(windows), frame == 0))
+    return float(np.abs(actions - expected).max())
+
+
+def map_difference(env_id: str, n: int, seed: int = 0) -> float:
+    """Return the largest difference between what n true states of the environment are mapped to here, and what the
+    environment itself observes of them and applies to its belt or mass.
+
+    The sensor's noise and delay are left out: they belong to the plant, not to the map. Nothing of the environment's
+    observations enters the measurements, so that a wrong map cannot cancel out.
+    """
+    interface = Interface.of(evaluation.make_env(env_id))
+    env = evaluation.make_env(env_id, {"sensor_noise": 0.0, "sensor_delay": 0})
+    by_force, rng, worst, left = env.task.actuator == "force", np.random.default_rng(seed), 0.0, n
+    episodes = max(1, min(20, n))  # each of another plant, where they are drawn
+    for episode in range(episodes):
+        observation, info = env.reset(seed=int(rng.integers(2**31)))
+        relative = "belt_speed" in env.task.randomise
+        unit = 1.0 if by_force or not relative else env.parameters.belt_speed
+        for _ in range(-(-left // (episodes - episode))):
+            left -= 1
+            seen = interface.observe(interface.measure(env, info))
+            worst = max(worst, float(np.abs(seen - observation).max()))
+            action = rng.uniform(-1.0, 1.0, 1).astype(np.float32)
+            command = unit * (interface.command_offset + interface.command_scale * float(action[0]))
+            before = info["v_belt"]
+            observation, _, terminated, truncated, info = env.step(action)
+            if by_force:
+                worst = max(worst, abs(info["force"] - command))
+            else:
+                most = env.task.belt_acceleration_limit * env.task.control_interval
+                worst = max(worst, abs(info["v_belt"] - before - float(np.clip(command - before, -most, most))))
+            if terminated or truncated:
+                observation, info = env.reset(seed=int(rng.integers(2**31)))
+                unit = 1.0 if by_force or not relative else env.parameters.belt_speed
+    return worst
+
+
+def latency(model: onnx.ModelProto, measurements: Measurements, calls: int = 5000) -> tuple[float, float]:
+    """Return median and 99th percentile of the time of one decision on one thread, in seconds."""
+    run = session(model).run
+    singles = [measurements[i % len(measurements)][None] for i in range(calls)]
+    for one in singles[:200]:
+        run(None, {MEASUREMENTS: one})
+    taken = np.empty(calls)
+    for i, one in enumerate(singles):
+        begun = time.perf_counter()
+        run(None, {MEASUREMENTS: one})
+        taken[i] = time.perf_counter() - begun
+    return float(np.median(taken)), float(np.quantile(taken, 0.99))
+
+
+def write(model: onnx.ModelProto, path: Path) -> None:
+    """Write a model, whole or not at all."""
+    with atomic_file(path, "wb") as file:
+        file.write(model.SerializeToString())

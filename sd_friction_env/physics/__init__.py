@@ -1,0 +1,1 @@
+"""The passive and the forced oscillator: parameters, motions, orbits, curves, basins; no Gymnasium, no drawing."""

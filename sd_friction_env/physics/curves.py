@@ -1,0 +1,154 @@
+"""Amplitude and frequency over the belt speed, as tidy tables."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sd_friction_env.physics.orbits import LimitCycle, OrbitError, attractors, equilibria, limit_cycle
+from sd_friction_env.physics.parameters import RANGES, STATE_LIMIT, OscillatorParameters, checked_number
+from sd_friction_env.physics.tables import Table
+
+_CYCLE_COLUMNS = (
+    "kind",
+    "amplitude",
+    "period",
+    "frequency",
+    "angular_frequency",
+    "stick_fraction",
+    "x_max",
+    "x_min",
+    "x_breakaway",
+    "x_restick",
+    "sticks",
+    "forward_arcs",
+    "floquet_multiplier",
+)
+
+
+def checked_belt_speeds(belt_speeds: ArrayLike) -> NDArray[np.float64]:
+    """Return belt speeds as an array of shape (n,).
+
+    Raises:
+        TypeError: if they are no numbers.
+        ValueError: if there are none, or one is not in its range.
+    """
+    try:
+        speeds = np.atleast_1d(np.asarray(belt_speeds, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise TypeError(f"belt_speeds must be numbers, got {belt_speeds!r}") from None
+    if speeds.ndim != 1 or not speeds.size:
+        raise ValueError(f"belt_speeds must have shape (n,) with n >= 1, got shape {speeds.shape}")
+    for speed in speeds:
+        checked_number("belt_speeds", float(speed), *RANGES["belt_speed"])
+    return speeds
+
+
+def _row(cycle: LimitCycle) -> dict[str, Any]:
+    """Return what a table says of a cycle and the start that reached it."""
+    row = {name: getattr(cycle, name) for name in _CYCLE_COLUMNS}
+    start = {"x_start": cycle.x_start, "v_start": cycle.v_start}
+    return {"belt_speed": cycle.parameters.belt_speed} | row | start | {"note": ""}
+
+
+def amplitude_curve(
+    parameters: OscillatorParameters,
+    belt_speeds: ArrayLike,
+    *,
+    x: float = 0.0,
+    v: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Table:
+    """Return the attractor at each belt speed: one row each, in the order given.
+
+    Args:
+        parameters: of the oscillator; their belt speed is not used.
+        belt_speeds: of shape (n,), each in [0, 10].
+        x, v: the start at every belt speed, in [-10, 10]; by default a mass set down at x = 0 moving with the belt.
+        progress: called with the rows done and the rows in all after each row.
+
+    Returns:
+        A table with the columns belt_speed, kind ("stick-slip", "pure-slip", "steady-slip", "neutral", "rest" or
+        "failed"), amplitude, period, frequency, angular_frequency, stick_fraction, x_max, x_min, x_breakaway,
+        x_restick, sticks, forward_arcs, floquet_multiplier, x_start, v_start and note (why a row failed, else empty).
+
+    Raises:
+        TypeError, ValueError: if an argument is not as said.
+    """
+    speeds = checked_belt_speeds(belt_speeds)
+    x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
+    if v is not None:
+        v = checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
+    rows = []
+    for done, speed in enumerate(speeds.tolist(), start=1):
+        try:
+            rows.append(_row(limit_cycle(parameters.replace(belt_speed=speed), x, v)))
+        except OrbitError as error:
+            rows.append(_failed_row(speed, x, speed if v is None else v, str(error)))
+        if progress is not None:
+            progress(done, len(speeds))
+    return _table(rows, parameters)
+
+
+def attractor_curves(
+    parameters: OscillatorParameters,
+    belt_speeds: ArrayLike,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Table:
+    """Return all attractors at each belt speed, one row each; alpha < 1 has two wells and may have one in each.
+
+    Args:
+        parameters: of the oscillator; their belt speed is not used.
+        belt_speeds: of shape (n,), each in (0, 10].
+        progress: as in :func:`amplitude_curve`.
+
+    Returns:
+        The columns of :func:`amplitude_curve` and ``well``: "left" or "right" of the middle equilibrium, "only" where
+        there is one equilibrium, "both" for a motion round all of them. A belt speed without an attractor that keeps
+        contact is one row of kind "failed".
+
+    Raises:
+        TypeError, ValueError: if an argument is not as said.
+    """
+    speeds = checked_belt_speeds(belt_speeds)
+    rows = []
+    for done, speed in enumerate(speeds.tolist(), start=1):
+        plant = parameters.replace(belt_speed=speed)
+        found = attractors(plant)
+        places = [e.x for e in equilibria(plant)]
+        rows += [_row(cycle) | {"well": _well(cycle, places)} for cycle in found]
+        if not found:
+            rows.append(
+                _failed_row(speed, float("nan"), float("nan"), "no attractor that keeps contact was found")
+                | {"well": ""}
+            )
+        if progress is not None:
+            progress(done, len(speeds))
+    return _table(rows, parameters)
+
+
+def _well(cycle: LimitCycle, places: list[float]) -> str:
+    if len(places) < 3:
+        return "only"
+    middle = places[1]
+    return "left" if cycle.x_max < middle else "right" if cycle.x_min > middle else "both"
+
+
+def _failed_row(belt_speed: float, x: float, v: float, note: str) -> dict[str, Any]:
+    row: dict[str, Any] = dict.fromkeys(_CYCLE_COLUMNS, float("nan"))
+    row |= {"kind": "failed", "sticks": 0, "forward_arcs": 0}
+    return row | {"belt_speed": belt_speed, "x_start": x, "v_start": v, "note": note}
+
+
+def _table(rows: list[dict[str, Any]], parameters: OscillatorParameters) -> Table:
+    names = ["belt_speed", *_CYCLE_COLUMNS, "x_start", "v_start", "note"]
+    names += [name for name in rows[0] if name not in names]
+    return cycle_table({name: [row[name] for row in rows] for name in names}, parameters)
+
+
+def cycle_table(columns: dict[str, Any], parameters: OscillatorParameters) -> Table:
+    """Return columns of cycles as a table that tells the oscillator."""
+    return Table(columns, {"parameters": dataclasses.asdict(parameters)})

@@ -1,0 +1,258 @@
+"""One history in time: samples, events and energy of the oscillator from a start, passive or driven."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sd_friction_env import kernel
+from sd_friction_env.physics.parameters import STATE_LIMIT, OscillatorParameters, brief_repr, checked_number
+from sd_friction_env.physics.tables import Table
+
+_MOST_SAMPLES = 50_000_000
+_CHUNK = 4096
+
+
+def amplitude(x_min: float, x_max: float) -> float:
+    """Return the amplitude of a motion between two extremes: half their distance."""
+    return 0.5 * (x_max - x_min)
+
+
+class Event(NamedTuple):
+    """A change of mode: its time, its kind and the state there.
+
+    Kinds: "restick" (slip ends in stick), "crossing" (v_rel changes sign without sticking), "grazing" (v_rel touches
+    zero), "breakaway" (stick ends), "switching" (x passes 0 where alpha = 0), "contact-loss" (N falls to zero; the
+    history ends).
+    """
+
+    time: float
+    kind: str
+    x: float
+    v: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnergyBalance:
+    """Where the energy went: change = damping + contact + control + excitation, each a work done on the mass.
+
+    Attributes:
+        change: of x'^2/2 + V(x). damping: -2 beta times the integral of x'^2. contact: work of the contact force.
+        control: work of the control force. excitation: work of the exciting force and of what modulates the stiffness.
+        residual: change minus the rest. relative_residual: the residual over the sum of the absolute works (0 if
+            nothing moved).
+    """
+
+    change: float
+    damping: float
+    contact: float
+    control: float
+    excitation: float = 0.0
+
+    @property
+    def residual(self) -> float:
+        """The part of the change that no work explains; zero but for integration errors."""
+        return self.change - self.damping - self.contact - self.control - self.excitation
+
+    @property
+    def relative_residual(self) -> float:
+        """The residual over the sum of the absolute works."""
+        works = abs(self.damping) + abs(self.contact) + abs(self.control) + abs(self.excitation)
+        return abs(self.residual) / works if works > 0.0 else 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trajectory:
+    """A history of the oscillator (dimensionless).
+
+    Attributes:
+        t, x, v, v_belt: samples, each of shape (n,); the last is at t_end exactly, unless ``status`` is not "ok".
+        mode: -1 slip backward, 0 stick, 1 slip forward, of shape (n,).
+        events: changes of mode, in order of time.
+        stick_time: time spent stuck.
+        energy: the energy balance.
+        status: "ok", "contact lost", "event limit" or "step limit"; the history ends where it stopped being "ok".
+        parameters: of the oscillator.
+    """
+
+    t: NDArray[np.float64]
+    x: NDArray[np.float64]
+    v: NDArray[np.float64]
+    v_belt: NDArray[np.float64]
+    mode: NDArray[np.int8]
+    events: tuple[Event, ...]
+    stick_time: float
+    energy: EnergyBalance
+    status: str
+    parameters: OscillatorParameters
+
+    def amplitude(self, since: float = 0.0) -> float:
+        """Return half the distance between the extremes of the samples of x from time ``since`` on."""
+        part = self.x[self.t >= since]
+        if not part.size:
+            raise ValueError(f"since must not exceed the last time {self.t[-1]!r}, got {since!r}")
+        return amplitude(float(part.min()), float(part.max()))
+
+    def to_table(self) -> Table:
+        """Return the samples as a table."""
+        return Table({"t": self.t, "x": self.x, "v": self.v, "v_belt": self.v_belt, "mode": self.mode})
+
+    def to_dataframe(self) -> Any:
+        """Return the samples as a pandas DataFrame (needs pandas)."""
+        return self.to_table().to_dataframe()
+
+
+def simulate(
+    parameters: OscillatorParameters,
+    x: float = 0.0,
+    v: float | None = None,
+    t_end: float = 100.0,
+    *,
+    dt: float = 0.01,
+    force: float | ArrayLike = 0.0,
+    belt_acceleration: float | ArrayLike = 0.0,
+    hold: float | None = None,
+) -> Trajectory:
+    """Follow the oscillator from (x, v) at t = 0 to t_end.
+
+    Args:
+        parameters: of the oscillator; the belt starts at ``parameters.belt_speed``.
+        x, v: the start, in [-10, 10]; v defaults to the belt speed, ripple included.
+        t_end: when to end, in [0, 1e7].
+        dt: time between samples, in [1e-6, 1e6].
+        force: control force u: a number, or values of shape (m,), each held for ``hold``.
+        belt_acceleration: of the belt, likewise.
+        hold: how long each value of an array is held; needed with arrays, which must cover t_end.
+
+    Raises:
+        TypeError, ValueError: if an argument is not as said.
+    """
+    x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
+    v = parameters.first_belt_speed if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
+    t_end = checked_number("t_end", t_end, 0.0, 1e7)
+    dt = checked_number("dt", dt, 1e-6, 1e6)
+    if t_end / dt > _MOST_SAMPLES:
+        raise ValueError(
+            f"dt = {dt!r} makes more than {_MOST_SAMPLES} samples up to t_end = {t_end!r}; take a longer dt"
+        )
+    forces = _held_values("force", force)
+    accelerations = _held_values("belt_acceleration", belt_acceleration)
+    segments = max(forces.size, accelerations.size)
+    if segments == 1:
+        hold = t_end
+    elif hold is None:
+        raise ValueError("hold must be given with an array of forces or belt accelerations: how long each is held")
+    else:
+        hold = checked_number("hold", hold, 1e-6, 1e7)
+        for name, values in (("force", forces), ("belt_acceleration", accelerations)):
+            if values.size > 1 and values.size * hold < t_end * (1.0 - 1e-12):
+                raise ValueError(
+                    f"{name} has {values.size} values held {hold!r} each, too few to reach t_end = {t_end!r}"
+                )
+
+    plant = parameters.plant
+    belt = parameters.belt_speed
+    grid = dt * np.arange(math.floor(t_end / dt * (1.0 + 1e-12)) + 1)
+    grid = np.append(grid[grid < t_end * (1.0 - 1e-12)], t_end) if t_end > 0.0 else np.zeros(1)
+    start_energy = 0.5 * v * v + kernel.energy_in_spring(plant, x)
+    parts = [
+        np.array(
+            [
+                [
+                    0.0,
+                    x,
+                    v,
+                    belt,
+                    kernel.mode_of(plant, kernel.State(x, v), kernel.Drive(belt, accelerations[0], forces[0])),
+                ]
+            ]
+        )
+    ]
+    events: list[Event] = []
+    damping = contact = control = excitation = stick_time = 0.0
+    status = kernel.OK
+    segment, begin = 0, 0.0
+    mode, u, a_belt = kernel.UNKNOWN, 0.0, 0.0
+    while begin < t_end and status == kernel.OK:
+        end = t_end if segment + 1 >= segments else min(t_end, (segment + 1) * hold)
+        before = u, a_belt
+        u = float(forces[min(segment, forces.size - 1)])
+        a_belt = float(accelerations[min(segment, accelerations.size - 1)])
+        if (u, a_belt) != before:
+            mode = kernel.UNKNOWN  # the drive has jumped
+        inside = grid[(np.searchsorted(grid, begin, "right")) : np.searchsorted(grid, end, "right")]
+        times = inside - begin
+        extra = not inside.size or inside[-1] < end
+        if extra:
+            times = np.append(times, end - begin)
+        done, x_begin = 0, x
+        t0, belt0 = begin, belt
+        while done < times.size and status == kernel.OK:
+            piece = times[done : done + _CHUNK] - (t0 - begin)
+            samples = np.empty((piece.size, 4))
+            buffer = np.empty((max(4 * kernel.MAX_EVENTS, piece.size), 4))
+            now = kernel.at_time(plant, t0)
+            taken, n_events, status, reached, int_v2, stuck, int_fv = kernel.trace(
+                now, mode, kernel.State(x, v), kernel.Drive(belt0, a_belt, u), piece, samples, buffer
+            )
+            if parameters.excited:
+                excitation += kernel.excitation_work(
+                    now, kernel.State(x, v), kernel.Drive(belt0, a_belt, u), reached, buffer[:n_events]
+                )
+            events += [Event(t0 + e[0], kernel.EVENT_NAMES[int(e[1])], e[2], e[3]) for e in buffer[:n_events].tolist()]
+            damping -= 2.0 * parameters.beta * int_v2
+            contact += int_fv
+            stick_time += stuck
+            x, v, belt0, last_mode = samples[taken - 1].tolist()
+            mode = int(last_mode)
+            stamps = t0 + piece[:taken]
+            if status != kernel.OK:
+                stamps[-1] = t0 + reached
+            elif done + taken == times.size:
+                stamps[-1] = end
+            keep = taken - 1 if extra and status == kernel.OK and done + taken == times.size else taken
+            parts.append(np.column_stack((stamps[:keep], samples[:keep])))
+            t0 = float(stamps[-1])
+            done += taken
+        belt = belt0
+        control += u * (x - x_begin)
+        segment, begin = segment + 1, end
+    table = np.concatenate(parts)
+    if parameters.ripple_amplitude > 0.0:
+        angles = parameters.ripple_frequency * table[:, 0] + parameters.ripple_phase
+        table[:, 3] += parameters.ripple_amplitude * np.cos(angles)
+    return Trajectory(
+        t=table[:, 0],
+        x=table[:, 1],
+        v=table[:, 2],
+        v_belt=table[:, 3],
+        mode=table[:, 4].astype(np.int8),
+        events=tuple(events),
+        stick_time=stick_time,
+        energy=EnergyBalance(
+            change=0.5 * v * v + kernel.energy_in_spring(kernel.at_time(plant, float(table[-1, 0])), x) - start_energy,
+            damping=damping,
+            contact=contact,
+            control=control,
+            excitation=excitation,
+        ),
+        status=kernel.STATUS_NAMES[status],
+        parameters=parameters,
+    )
+
+
+def _held_values(name: str, values: Any) -> NDArray[np.float64]:
+    try:
+        array = np.atleast_1d(np.asarray(values, dtype=np.float64))
+    except OverflowError:
+        raise ValueError(f"{name} must be finite and within [-1e6, 1e6], got {brief_repr(values)}") from None
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a number or an array of numbers, got {brief_repr(values)}") from None
+    if array.ndim != 1 or not array.size:
+        raise ValueError(f"{name} must have shape (m,) with m >= 1, got shape {array.shape}")
+    if not np.all(np.isfinite(array)) or np.abs(array).max() > 1e6:
+        worst = array[~(np.abs(array) <= 1e6)][0]
+        raise ValueError(f"{name} must be finite and within [-1e6, 1e6], got {worst!r} among its values")
+    return array

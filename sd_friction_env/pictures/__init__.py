@@ -1,0 +1,1 @@
+"""Drawing: the renderer, plots, video."""

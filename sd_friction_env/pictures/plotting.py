@@ -1,0 +1,340 @@
+"""Figures drawn from tables and histories, readable in grey; needs matplotlib (extra "plot")."""
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sd_friction_env.physics.basins import Basins
+from sd_friction_env.physics.forced import ForcedBasins
+from sd_friction_env.physics.simulation import Trajectory
+from sd_friction_env.physics.tables import Table
+from sd_friction_env.storage import atomic_file, checked_ending
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours; lines differ in dash or weight too, so that grey prints tell them apart.
+BLUE, VERMILION, GREEN, GREY, BLACK = "#0072B2", "#D55E00", "#009E73", "#8A8A8A", "#202020"
+BRANCHES = {
+    "stick-slip": {"color": BLUE, "linestyle": "-", "linewidth": 2.2, "label": r"stick-slip, $A_0$"},
+    "pure-slip": {"color": VERMILION, "linestyle": (0, (4, 1.2)), "linewidth": 2.2, "label": r"pure slip, $A_1$"},
+    "steady-slip": {"color": GREY, "linestyle": ":", "linewidth": 1.8, "label": "steady slip"},
+    "neutral": {"color": GREEN, "linestyle": "-.", "linewidth": 1.8, "label": "neutral, as started"},
+}
+PAIR = ({"color": BLUE, "linewidth": 2.0}, {"color": VERMILION, "linewidth": 1.6, "linestyle": (0, (4, 1.2))})
+# A family of curves: colours of falling lightness, a marker each.
+FAMILY = (
+    {"color": "#56B4E9", "marker": "o"},
+    {"color": "#E69F00", "marker": "s"},
+    {"color": GREEN, "marker": "^"},
+    {"color": BLACK, "marker": "D"},
+)
+CONTROLLED = ({"marker": "o", "color": GREEN}, {"marker": "s", "color": VERMILION}, {"marker": "^", "color": BLACK})
+
+
+FORMATS = (".png", ".svg", ".pdf")
+
+
+@contextlib.contextmanager
+def house_style() -> Iterator[None]:
+    """Draw in matplotlib's own style within the block, or the function that this decorates.
+
+    What the user's matplotlibrc asks for may not be there: LaTeX, a font. What else draws into our figures does so in
+    this style too.
+
+    Raises:
+        ImportError: if matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise ImportError('figures need matplotlib: pip install "sd-friction-env[plot]"') from error
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams["svg.hashsalt"] = "sd_friction_env"  # the names in an .svg do not change from run to run
+        yield
+
+
+@house_style()
+def new_figure(width: float, height: float, rows: int, columns: int, **arguments: Any) -> tuple["Figure", Any]:
+    """Return a figure (inches) and its axes, an array of shape (rows, columns), without touching a display.
+
+    Raises:
+        ImportError: if matplotlib is not installed.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, **arguments)
+    for axis in axes.flat:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(color="0.92", linewidth=0.8)
+        axis.set_axisbelow(True)
+    return figure, axes
+
+
+@house_style()
+def save_figure(figure: "Figure", path: str | os.PathLike[str], dpi: int = 150) -> None:
+    """Write a figure, whole or not at all, with nothing in the file that changes from run to run.
+
+    Raises:
+        ValueError: if the name ends in none of ``FORMATS``. OSError: if the file cannot be written.
+    """
+    ending = checked_ending(path, FORMATS, "a figure's path")
+    stamp = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}[ending]
+    with atomic_file(path, "wb") as file:
+        figure.savefig(file, format=ending[1:], dpi=dpi, metadata={stamp: None})
+
+
+@house_style()
+def draw_amplitude_curve(axis: "Axes", curve: Table, column: str = "amplitude") -> None:
+    """Draw one curve over the belt speed, a line for each kind of motion."""
+    for kind, style in BRANCHES.items():
+        shown = np.where(curve["kind"] == kind, curve[column], np.nan)
+        if np.isfinite(shown).any():
+            axis.plot(curve["belt_speed"], shown, **style)  # type: ignore[arg-type]
+
+
+@house_style()
+def draw_family_member(axis: "Axes", curve: Table, column: str, label: str, style: Mapping[str, str]) -> None:
+    """Draw one curve of several: solid in stick-slip, dashed in pure slip, with a few markers to tell it in grey."""
+    for kind, line in (("stick-slip", "-"), ("pure-slip", (0, (3, 1)))):
+        shown = np.where(curve["kind"] == kind, curve[column], np.nan)
+        every = {"markevery": (4, 16), "marker": style["marker"], "markersize": 4.5} if kind == "stick-slip" else {}
+        axis.plot(
+            curve["belt_speed"],
+            shown,
+            color=style["color"],
+            linestyle=line,
+            linewidth=1.8,
+            label=label if kind == "stick-slip" else None,
+            **every,  # type: ignore[arg-type]
+        )
+
+
+@house_style()
+def mark_critical_speeds(axis: "Axes", v_b0: float, v_b1: float) -> None:
+    """Mark v_b0 and v_b1 with their values; the names stand to the left and right of the pair."""
+    marks = ((v_b0, "right", rf"$v_{{b0}} = {v_b0:.4f}$ "), (v_b1, "left", rf" $v_{{b1}} = {v_b1:.4f}$"))
+    for speed, side, label in marks:
+        if np.isfinite(speed):
+            axis.axvline(speed, color="0.45", linewidth=0.9, linestyle=(0, (6, 3)))
+            top = axis.get_ylim()[1]
+            axis.text(speed, 0.99 * top, label, rotation=90, va="top", ha=side, fontsize=8, color="0.3")
+
+
+@house_style()
+def draw_controlled_points(axis: "Axes", series: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> None:
+    """Lay closed-loop amplitudes over a passive curve: (belt speeds, amplitudes) by name."""
+    for style, (name, (speeds, amplitudes)) in zip(CONTROLLED, series.items(), strict=False):
+        axis.plot(speeds, amplitudes, linestyle="none", markersize=5.5, markeredgecolor="white", label=name, **style)  # type: ignore[arg-type]
+
+
+@house_style()
+def draw_before_and_after(histories: Mapping[str, Trajectory], switched_on: float, title: str) -> "Figure":
+    """Draw displacement, velocity and phase portrait of controlled histories, control starting at ``switched_on``.
+
+    Args:
+        histories: one row of panels each, by name. switched_on: time at which control begins. title: of the figure.
+    """
+    figure, axes = new_figure(11.0, 2.9 * len(histories), len(histories), 3, width_ratios=(2.2, 2.2, 1.6))
+    figure.suptitle(title)
+    for row, (name, history) in zip(axes, histories.items(), strict=True):
+        t, x, v, belt = history.t, history.x, history.v, history.v_belt
+        before = t <= switched_on
+        for axis, values, label in ((row[0], x, r"displacement $x$"), (row[1], v, r"velocity $\dot x$")):
+            axis.axvspan(switched_on, t[-1], color="0.95", zorder=0)
+            axis.plot(t[before], values[before], color=GREY, linewidth=1.4)
+            axis.plot(t[~before], values[~before], color=BLUE, linewidth=1.4)
+            axis.set_xlabel(r"time $\tau$")
+            axis.set_ylabel(label)
+            axis.margins(x=0)
+        row[0].set_title(name, loc="left", fontsize=10)
+        row[1].plot(t, belt, color=VERMILION, linewidth=1.0, linestyle=(0, (4, 2)), label=r"belt $v_b$")
+        row[1].legend(loc="lower right", fontsize=8, frameon=False)
+        row[2].plot(x[before], v[before], color=GREY, linewidth=1.2, label="passive")
+        row[2].plot(x[~before], v[~before], color=BLUE, linewidth=1.2, label="controlled")
+        row[2].plot(x[-1:], v[-1:], marker="o", color=BLACK, markersize=5, linestyle="none", label="end")
+        row[2].set_xlabel(r"$x$")
+        row[2].set_ylabel(r"$\dot x$")
+        row[2].legend(loc="lower left", fontsize=8, frameon=False)
+    return figure
+
+
+@house_style()
+def draw_amplitude_table(table: Table, members: Sequence[Mapping[str, Any]]) -> "Figure":
+    """Draw the curves of a sweep: one by its branches, several as a family, attractors as points.
+
+    Args:
+        table: as :func:`curves.amplitude_curve` makes it, with a column for each swept parameter.
+        members: the swept parameters of each curve, by name.
+    """
+    figure, axes = new_figure(6.4, 4.4, 1, 1)
+    axis = axes[0, 0]
+    for i, member in enumerate(members):
+        chosen = np.ones(table.n_rows, dtype=bool)
+        for name, value in member.items():
+            chosen &= table[name] == value
+        curve = Table({name: column[chosen] for name, column in table.items()})
+        label = ", ".join(f"{name} = {value}" for name, value in member.items())
+        if "well" in table:
+            for well, marker in (("left", "<"), ("right", ">"), ("only", "o"), ("both", "D")):
+                part = curve["well"] == well
+                if part.any():
+                    style = {"marker": marker, "markersize": 3.5, "linestyle": "none", "color": FAMILY[i % 4]["color"]}
+                    name = f"{label} {well} well" if well in ("left", "right") else label or "attractor"
+                    axis.plot(curve["belt_speed"][part], curve["amplitude"][part], label=name, **style)
+        elif len(members) == 1:
+            draw_amplitude_curve(axis, curve)
+        else:
+            draw_family_member(axis, curve, "amplitude", label, FAMILY[i % len(FAMILY)])
+    axis.set_xlabel(r"belt speed $v_b$")
+    axis.set_ylabel(r"amplitude $A$")
+    axis.set_ylim(bottom=0.0)
+    if len(members) <= 12:
+        axis.legend(fontsize=8, frameon=False)
+    return figure
+
+
+@house_style()
+def draw_history(history: Trajectory) -> "Figure":
+    """Draw displacement, velocity and phase portrait of one history, stick phases marked."""
+    figure, axes = new_figure(11.0, 3.2, 1, 3, width_ratios=(2.2, 2.2, 1.6))
+    stuck = history.mode == 0
+    for axis, values, label in ((axes[0, 0], history.x, "$x$"), (axes[0, 1], history.v, r"$\dot x$")):
+        axis.plot(history.t, values, color=BLUE, linewidth=1.4)
+        axis.plot(history.t, np.where(stuck, values, np.nan), color=VERMILION, linewidth=2.6, label="stick")
+        axis.set_xlabel(r"time $\tau$")
+        axis.set_ylabel(label)
+        axis.margins(x=0)
+    axes[0, 2].plot(history.x, history.v, color=BLUE, linewidth=1.2)
+    axes[0, 2].plot(np.where(stuck, history.x, np.nan), history.v, color=VERMILION, linewidth=2.6)
+    axes[0, 2].set_xlabel("$x$")
+    axes[0, 2].set_ylabel(r"$\dot x$")
+    axes[0, 0].legend(fontsize=8, frameon=False)
+    return figure
+
+
+@house_style()
+def draw_basins(axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], found: Basins) -> None:
+    """Draw a grid of basins with the attractors on it.
+
+    Args:
+        x, v: axes of the grid, shapes (n,) and (m,). found: its basins, labels of shape (m, n).
+    """
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patches import Patch
+
+    shades = ["#F5F5F5", "#BBBBBB", "#A6CEE3", "#FDD9B5", "#B9E3C6", "#DDC7E8", "#F7EFA5"]
+    names = ["undecided", "contact lost", *(f"{cycle.kind}" for cycle in found.attractors)]
+    axis.grid(visible=False)
+    colours = [shades[i % len(shades)] for i in range(len(names))]
+    norm = BoundaryNorm(np.arange(-2.5, len(found.attractors)), len(names))
+    axis.pcolormesh(x, v, found.labels, cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True)
+    lines = ("-", (0, (4, 1.5)), (0, (1, 1)), "-.")
+    for i, cycle in enumerate(found.attractors):
+        states = np.array([cycle.state(phase) for phase in np.linspace(0.0, 1.0, 400)])
+        axis.plot(*states.T, color=BLACK, linewidth=1.6, linestyle=lines[i % len(lines)])
+        if cycle.amplitude == 0.0:
+            axis.plot(*states[0], marker="o", color=BLACK)
+    axis.axhline(found.parameters.belt_speed, color="0.45", linewidth=0.8, linestyle=":")
+    axis.set_xlim(x[0], x[-1])
+    axis.set_ylim(v[0], v[-1])
+    axis.set_xlabel("start $x$")
+    axis.set_ylabel(r"start $\dot x$")
+    patches = []
+    for label in range(-2, len(found.attractors)):
+        share = found.fraction(label)[0]
+        if share > 0.0:
+            text = f"{names[label + 2]}, {100.0 * share:.1f}%"
+            patches.append(Patch(facecolor=colours[label + 2], edgecolor="0.6", label=text))
+    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=4, frameon=False)
+
+
+@house_style()
+def draw_bifurcation(axis: "Axes", diagram: Table) -> None:
+    """Draw the section points of :func:`forced.bifurcation_diagram`, the way up under the way down."""
+    for way, color, size in (("up", BLACK, 1.6), ("down", VERMILION, 0.5)):
+        part = diagram["direction"] == way
+        if part.any():
+            style: dict[str, Any] = {
+                "linestyle": "none",
+                "marker": ".",
+                "markersize": size,
+                "markeredgewidth": 0.0,
+                "color": color,
+            }
+            axis.plot(diagram["value"][part], diagram["x"][part], rasterized=True, **style)
+            axis.plot([], [], linestyle="none", marker="o", markersize=2.0 + 2.0 * size, color=color, label=way)
+    axis.set_ylabel("$x$ on the section")
+    axis.legend(fontsize=8, frameon=False, loc="upper right")
+
+
+@house_style()
+def draw_exponents(axis: "Axes", table: Table, floor: float = -0.25) -> None:
+    """Draw the largest exponent over the value of a sweep, with two standard errors; below ``floor`` it is cut off."""
+    for way, color, width, line in (("up", BLACK, 1.6, "-"), ("down", VERMILION, 1.0, (0, (4, 1.2)))):
+        part = table["direction"] == way
+        if part.any():
+            exponent = np.maximum(table["exponent"][part], 2.0 * floor)  # minus infinity too
+            spread = 2.0 * table["standard_error"][part]
+            axis.plot(table["value"][part], exponent, color=color, linewidth=width, linestyle=line, label=way)
+            axis.fill_between(table["value"][part], exponent - spread, exponent + spread, color=color, alpha=0.25)
+    axis.axhline(0.0, color="0.45", linewidth=0.9)
+    axis.set_ylim(bottom=floor)
+    axis.set_ylabel(r"largest exponent $\lambda$")
+
+
+@house_style()
+def draw_section(axis: "Axes", section: Table) -> None:
+    """Draw a stroboscopic section, :func:`forced.poincare_section`, its stuck states apart."""
+    stuck = section["mode"] == 0
+    for part, color, label in ((~stuck, BLUE, "slip"), (stuck, VERMILION, "stick")):
+        style: dict[str, Any] = {
+            "linestyle": "none",
+            "marker": ".",
+            "markersize": 2.2,
+            "markeredgewidth": 0.0,
+            "color": color,
+        }
+        axis.plot(section["x"][part], section["v"][part], rasterized=True, **style)
+        axis.plot([], [], linestyle="none", marker="o", markersize=4.0, color=color, label=label)
+    axis.set_xlabel("$x$")
+    axis.set_ylabel(r"$\dot x$")
+    axis.legend(fontsize=8, frameon=False)
+
+
+@house_style()
+def draw_forced_basins(axis: "Axes", found: ForcedBasins) -> None:
+    """Draw a grid of forced basins with the section points of the periodic attractors on it."""
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patches import Patch
+
+    shades = ["#F5F5F5", "#8A8A8A", "#A6CEE3", "#FDD9B5", "#B9E3C6", "#DDC7E8", "#F7EFA5"]
+    names = ["undecided", "contact lost", *(f"period {orbit.multiple}" for orbit in found.attractors)]
+    names += ["chaos"] if found.chaos is not None else []
+    colours = [shades[i % len(shades)] for i in range(len(names))]
+    norm = BoundaryNorm(np.arange(-2.5, len(names) - 2), len(names))
+    axis.grid(visible=False)
+    axis.pcolormesh(
+        found.x, found.v, found.labels, cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True
+    )
+    for orbit, marker in zip(found.attractors, "osD^v<>ph*" * len(found.attractors), strict=False):
+        style: dict[str, Any] = {"linestyle": "none", "markersize": 5.5, "markeredgecolor": "white", "color": BLACK}
+        axis.plot(*orbit.points.T, marker=marker, **style)
+    axis.axhline(found.parameters.belt_speed, color="0.45", linewidth=0.8, linestyle=":")
+    axis.set_xlim(found.x[0], found.x[-1])
+    axis.set_ylim(found.v[0], found.v[-1])
+    axis.set_xlabel("start $x$")
+    axis.set_ylabel(r"start $\dot x$")
+    patches = [
+        Patch(facecolor=colours[i], edgecolor="0.6", label=f"{names[i]}, {100.0 * found.fraction(i - 2):.1f}%")
+        for i in range(len(names))
+        if found.fraction(i - 2) > 0.0
+    ]
+    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=4, frameon=False)

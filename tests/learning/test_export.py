@@ -1,0 +1,194 @@
+"""ONNX: the exported agent does what the agent does, from what is measured to what is commanded."""
+
+import dataclasses
+import itertools
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+import onnx
+
+from scripts import export as script
+from sd_friction_env import ENVIRONMENT_IDS
+from sd_friction_env.control.policies import NetworkPolicy
+from sd_friction_env.control.pretrained import pretrained_file
+from sd_friction_env.learning import evaluation, export
+
+RANDOMISED = "SDFriction/BeltSpeedRandomised-v0"
+FORCE, BELT, SENSED = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0", "SDFriction/BeltSpeedSensed-v0"
+
+
+def network(env_id, frames=1, activation="Tanh", output="clip"):
+    rng = np.random.default_rng(5)
+    inputs = frames * evaluation.make_env(env_id).observation_space.shape[0]
+    sizes = [inputs, 16, 8, 1]
+    layers = [(rng.normal(size=(a, b)) / np.sqrt(a), 0.1 * rng.normal(size=b)) for a, b in itertools.pairwise(sizes)]
+    return NetworkPolicy(tuple(layers), activation=activation, output=output, frames=frames)
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENT_IDS)
+@pytest.mark.parametrize(("frames", "activation", "output"), [(1, "Tanh", "clip"), (8, "ReLU", "tanh")])
+def test_the_model_acts_as_the_agent_on_ten_thousand_measurements(env_id, frames, activation, output):
+    policy = network(env_id, frames, activation, output)
+    model = export.build(policy, evaluation.make_env(env_id))
+    measurements = export.trial_measurements(policy, env_id, 10_000)
+    assert measurements.shape == (10_000, frames, policy.observation_size)
+    assert measurements.dtype == np.float32
+    assert export.worst_difference(model, policy, env_id, measurements) < export.TOLERANCE
+    observations = export.Interface.of(evaluation.make_env(env_id)).observe(measurements)
+    limit = evaluation.make_env(env_id).task.observation_limit
+    assert (np.abs(observations) == limit).any()  # clipping is tried
+    if frames > 1:
+        # and young windows, zero but for what single precision makes of the measurements at rest
+        assert (np.abs(observations[: 10_000 // 2, 0]) < 1e-7).all(axis=-1).any()
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENT_IDS)
+def test_measurements_and_commands_mean_what_the_environment_means_by_them(env_id):
+    assert export.map_difference(env_id, 2000) < export.TOLERANCE
+
+
+@pytest.mark.parametrize("wrong", [{"offsets": (0.82, 0.0, 0.2), "scales": (0.39, 0.1, 0.1)}, {"command_scale": 0.1}])
+def test_a_wrong_map_is_noticed(wrong, monkeypatch):
+    right = export.Interface.of(evaluation.make_env(RANDOMISED))
+    monkeypatch.setattr(export.Interface, "of", lambda env: dataclasses.replace(right, **wrong))
+    assert export.map_difference(RANDOMISED, 500) > 1e-3
+
+
+def test_where_the_plants_belt_speed_is_drawn_the_belt_is_told_relative_to_it():
+    model = export.build(network(RANDOMISED), evaluation.make_env(RANDOMISED))
+    said = {prop.key: prop.value for prop in model.metadata_props}
+    assert json.loads(said["measurements"]) == ["x", "v", "v_belt/belt_speed"]
+    assert said["command"] == "target of the belt's speed, over its nominal speed"
+    assert json.loads(said["young_window_is_filled_with"])[2] == 1.0
+
+
+def test_a_wrong_model_is_noticed():
+    policy, other = network(BELT), network(BELT, output="tanh")
+    model = export.build(policy, evaluation.make_env(BELT))
+    measurements = export.trial_measurements(policy, BELT, 1000)
+    assert export.worst_difference(model, other, BELT, measurements) > 1e-3
+
+
+@pytest.mark.parametrize("env_id", [FORCE, BELT])
+def test_it_controls_from_what_is_measured_to_what_is_commanded(env_id):
+    """Fed with the true state, it drives the environment as the agent does, and its command is what is applied."""
+    policy = network(env_id, frames=3)
+    env, twin = evaluation.make_env(env_id), evaluation.make_env(env_id)
+    model = export.build(policy, env)
+    run = export.session(model).run
+    said = {prop.key: prop.value for prop in model.metadata_props}
+    window = np.tile(np.array(json.loads(said["young_window_is_filled_with"]), np.float32), (3, 1))
+    names = json.loads(said["measurements"])
+    observation, info = env.reset(seed=4)
+    twin.reset(seed=4)
+    state = None
+    for t in range(60):
+        window = np.concatenate([window[1:], np.array([[info[name] for name in names]], np.float32)])
+        action, command = run(None, {"measurements": window[None]})
+        expected, state = policy.predict(observation, state, t == 0)
+        assert action[0] == pytest.approx(expected, abs=1e-5)  # measured in single precision
+        if env_id == FORCE:
+            assert command[0, 0] == pytest.approx(env.task.force_limit * action[0, 0], rel=1e-6)
+        else:
+            assert command[0, 0] == pytest.approx(0.2 * (1.0 + 0.5 * action[0, 0]), rel=1e-6)
+        observation, *_, info = env.step(expected)
+        twin.step(action[0])
+        if env_id == BELT and abs(command[0, 0] - window[-1, 2]) < 0.04:  # within what its acceleration allows
+            assert twin.get_state().v_belt == pytest.approx(command[0, 0], abs=1e-6)
+
+
+def test_the_model_says_what_it_wants():
+    model = export.build(network(SENSED, 8), evaluation.make_env(SENSED), {"environment": SENSED})
+    said = {prop.key: prop.value for prop in model.metadata_props}
+    assert json.loads(said["measurements"]) == ["x"]
+    assert said["environment"] == SENSED
+    assert said["command"] == "target of the belt's speed"
+    assert float(said["control_interval"]) == 0.1
+    assert "the last 8 measurements" in said["window"]
+    (shape,) = [one.type.tensor_type.shape for one in model.graph.input]
+    assert [dim.dim_value or dim.dim_param for dim in shape.dim] == ["n", 8, 1]
+
+
+def test_what_cannot_be_measured_or_does_not_fit_is_refused():
+    shown = gym.make("SDFriction/ForceRandomised-v0", show_parameters=True).unwrapped
+    with pytest.raises(ValueError, match="shown parameters cannot be exported"):
+        export.build(network(FORCE), shown)
+    with pytest.raises(ValueError, match="the agent observes 2 values, and the environment gives 3"):
+        export.build(network(FORCE), evaluation.make_env(BELT))
+
+
+def test_the_script_writes_the_packages_agent_and_a_run(tmp_path, capsys):
+    out = tmp_path / "agent.onnx"
+    small = ["--trials", "300"]
+    assert script.main(["--task", "belt", "--tier", "sensed", "--out", str(out), *small]) == 0
+    text = capsys.readouterr().out
+    assert "largest difference of actions over 300 measurements" in text
+    assert "by onnxruntime" in text
+    model = onnx.load(out)
+    said = {prop.key: prop.value for prop in model.metadata_props}
+    assert said["environment"] == SENSED
+    assert json.loads(said["origin"])["env_id"] == SENSED
+    before = out.read_bytes()
+    with pytest.raises(SystemExit):
+        script.main(["--task", "force", "--out", str(out), *small])
+    assert "exists: replace it with --force" in capsys.readouterr().err
+    assert out.read_bytes() == before
+    file = str(pretrained_file(FORCE))
+    assert script.main([file, "--task", "force", "--out", str(out), "--force", *small]) == 0
+    assert script.main(["agents/pretrained/force-nominal-ppo-0", "--out", str(tmp_path / "b.ONNX"), *small]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["agent.onnx", "b.ONNX"]
+
+
+def test_a_model_that_differs_is_not_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(export, "worst_difference", lambda *arguments: float("nan"))
+    out = tmp_path / "agent.onnx"
+    assert script.main(["--task", "force", "--out", str(out), "--trials", "100"]) == 1
+    assert "nothing was written" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--out", "a.onnx"], "name a run folder or a policy.npz, or --task"),
+        (["--task", "force", "--out", "a.txt"], "--out must be a file FILE.onnx"),
+        (["--task", "force", "--out", "nowhere/a.onnx"], "in a folder that exists"),
+        (["--task", "force", "--out", "a.onnx", "--trials", "1"], "--trials must be at least 2, got 1"),
+        (["nothing.npz", "--task", "force", "--out", "a.onnx"], "nothing.npz"),
+        (["nothing.npz", "--out", "a.onnx"], "needs --task"),
+        (["runs/nothing", "--out", "a.onnx"], "there is no run folder"),
+        (["--task", "rope", "--out", "a.onnx"], "invalid choice: 'rope'"),
+        (["--tier", "sensed", "--out", "a.onnx"], "--tier sensed needs --task"),
+        (["--env-id", "SDFriction/Rope-v0", "--out", "a.onnx"], "--env-id must be one of"),
+        (["--env-id", FORCE, "--task", "force", "--out", "a.onnx"], "exclude one another"),
+    ],
+)
+def test_the_script_refuses_what_cannot_be(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        script.main(arguments)
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_agent_of_another_task_is_refused(tmp_path, capsys):
+    out = str(tmp_path / "a.onnx")
+    for command in (
+        ["agents/pretrained/force-nominal-ppo-0", "--task", "belt", "--out", out],
+        [str(pretrained_file(FORCE)), "--task", "belt", "--out", out],
+        [str(pretrained_file(SENSED)), "--task", "force", "--tier", "sensed", "--out", out],
+        [str(pretrained_file(FORCE)), "--env-id", "SDFriction/ForceRandomised-v0", "--out", out],
+    ):
+        with pytest.raises(SystemExit):
+            script.main(command)
+        assert "was trained on" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -89,7 +89,7 @@ figures: setup ## compute and draw the paper's figures again
 	for name in 2 3 4 5 basins linear chaos control; do "$(RUN)" scripts/figure_$$name.py || exit 1; done
 
 report: setup ## evaluate every controller on every task; write report_output/report.html (a minute)
-	"$(RUN)" scripts/report.py $(ARGS)
+	"$(RUN)" -m sd_friction_env report $(ARGS)
 
 docs: export NO_MKDOCS_2_WARNING := 1
 docs: setup ## build the documentation into site/ (open site/index.html)

@@ -14,6 +14,7 @@ import pytest
 import sd_friction_env
 from sd_friction_env import OscillatorParameters, kernel, limit_cycle
 from sd_friction_env.kernel import compilation
+from sd_friction_env.storage import AGENTS
 
 pytestmark = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="nothing is compiled")
 
@@ -240,11 +241,11 @@ def copied(tmp_path, *, with_cache):
     limit_cycle(OscillatorParameters())  # compiled, if it was not
     left = shutil.ignore_patterns() if with_cache else shutil.ignore_patterns("__pycache__")
     shutil.copytree(PACKAGE, tmp_path / "sd_friction_env", ignore=left)
-    if (PACKAGE.parent / "agents" / "hyperparameters").is_dir():
-        shutil.copytree(PACKAGE.parent / "agents" / "hyperparameters", tmp_path / "agents" / "hyperparameters")
+    shutil.copytree(AGENTS, tmp_path / "agents", ignore=shutil.ignore_patterns("pretrained", "optimum"))
     return tmp_path / "sd_friction_env"
 
 
+@pytest.mark.slow  # compiles the kernel
 def test_the_doctor_works_without_a_folder_for_compiled_code(tmp_path):
     package = copied(tmp_path, with_cache=False)
     for folder in (package / "kernel", package / "kernel" / "friction"):
@@ -260,6 +261,7 @@ def test_the_doctor_works_without_a_folder_for_compiled_code(tmp_path):
     assert "compiling iterate_to_attractor, about" in error
 
 
+@pytest.mark.slow  # compiles the kernel
 def test_the_doctor_works_with_damaged_files_and_names_the_folder_in_use(tmp_path):
     package = copied(tmp_path, with_cache=True)
     folder = package / "kernel" / "__pycache__" if os.environ.get("NUMBA_CACHE_DIR") is None else None
@@ -312,11 +314,11 @@ print(mode, normal, *kernel.left_alone.stats.cache_hits.values())
 """
 
 
+@pytest.mark.slow  # compiles the kernel
 def test_an_edit_of_a_callee_in_another_file_or_of_a_users_law_renews_the_caller(tmp_path):
     package = tmp_path / "sd_friction_env"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-    if (PACKAGE.parent / "agents" / "hyperparameters").is_dir():
-        shutil.copytree(PACKAGE.parent / "agents" / "hyperparameters", tmp_path / "agents" / "hyperparameters")
+    shutil.copytree(AGENTS, tmp_path / "agents", ignore=shutil.ignore_patterns("pretrained", "optimum"))
     law, spring = tmp_path / "own.py", package / "kernel" / "springs" / "linear.py"
     law.write_text(OWN)
 
@@ -336,6 +338,7 @@ def test_an_edit_of_a_callee_in_another_file_or_of_a_users_law_renews_the_caller
     assert told() == ["-1", "3.0"]
 
 
+@pytest.mark.slow  # compiles the kernel
 def test_what_is_compiled_for_a_law_of_a_script_is_kept(tmp_path):
     (tmp_path / "script.py").write_text(OWN + ASK.replace("from own import Level\n", ""))
 

@@ -1,8 +1,8 @@
 """Hooks of MkDocs: add to the site what lies outside docs/ (figures, docstrings, the notebook, the changelog).
 
-Marks in the pages say where it goes: ``<!-- docstring: NAME -->`` becomes a class's docstring, ``<!-- arguments: NAME -->``
-a table of a dataclass's fields with their defaults, ``<!-- ids -->`` the list of registered environments,
-``<!-- include: PATH -->`` a file of the repository.
+Marks in the pages say where it goes: ``<!-- docstring: NAME -->`` becomes a class's docstring,
+``<!-- arguments: NAME -->`` a table of a dataclass's fields with their defaults, ``<!-- ids -->`` the list of
+registered environments, ``<!-- include: PATH -->`` a file of the repository.
 
 The notebook is stored with its outputs: docs/renew_notebook.py.
 """
@@ -84,7 +84,7 @@ def overview() -> str:
     found |= {name: public_names()[f"sd_friction_env.{path}"] for name, path in sd_friction_env._MODULES.items()}
     parts = [
         "# API",
-        "These names import from the top level: `from sd_friction_env import simulate`. "
+        "Import these names from the top level: `from sd_friction_env import simulate`.",
         "The pages on the left hold everything else, one module each.",
     ]
     for room, title in ROOMS.items():

@@ -16,7 +16,7 @@ import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import griffe
 from mkdocs.config.defaults import MkDocsConfig
@@ -35,8 +35,6 @@ ROOMS = {
     "pictures": "Pictures",
     "learning": "Learning",
 }
-
-Documented: TypeAlias = ast.Module | ast.ClassDef | ast.FunctionDef
 
 _ENTRY_NAMES = r"((?:\*{0,2}\w+, )*\*{0,2}\w+)"
 _SHARED_LINE = re.compile(rf"(?<=\.) {_ENTRY_NAMES}: ")
@@ -60,21 +58,24 @@ class Described(NamedTuple):
 @functools.cache
 def public_names() -> dict[str, Described]:
     """Return modules, classes, methods and functions by the names that docstrings use for them."""
-    names = {}
+    names: dict[str, Described] = {}
 
-    def add(name: str, full_name: str, node: Documented) -> None:
-        paragraph = (ast.get_docstring(node) or "").strip().partition("\n\n")[0]
-        names[name] = Described(full_name, " ".join(paragraph.split()))
+    def add(name: str, full_name: str, docstring: str | None) -> None:
+        names[name] = Described(full_name, " ".join((docstring or "").strip().partition("\n\n")[0].split()))
 
     for module in modules():
         tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8"))
-        add(module, module, tree)
+        add(module, module, ast.get_docstring(tree))
         for node in tree.body:
             if isinstance(node, ast.ClassDef | ast.FunctionDef):
-                add(node.name, f"{module}.{node.name}", node)
+                add(node.name, f"{module}.{node.name}", ast.get_docstring(node))
             for part in node.body if isinstance(node, ast.ClassDef) else ():
                 if isinstance(part, ast.FunctionDef):
-                    add(f"{node.name}.{part.name}", f"{module}.{node.name}.{part.name}", part)
+                    name = f"{node.name}.{part.name}"
+                    add(name, f"{module}.{name}", ast.get_docstring(part))
+    for name, path in sd_friction_env._PUBLIC.items():
+        if name not in names:  # defined in the kernel, shown where it is imported from
+            add(name, f"sd_friction_env.{path}.{name}", inspect.getdoc(getattr(sd_friction_env, name)))
     return names
 
 

@@ -99,7 +99,7 @@ def test_the_scripts_that_a_page_names_take_the_options_that_it_shows(page, comm
 
 def test_every_command_of_the_pages_is_of_a_kind_that_is_checked():
     known = ("sd-friction ", "python scripts/", "python -m rl_zoo3.train ", "FOLDER=$(sd-friction hyperparameters)")
-    install = ('python -m pip install ".[train,plot]"',)
+    install = ('python -m pip install -e ".[train,plot]"',)
     assert [pair for pair in COMMANDS if not pair[1].startswith(known) and pair[1] not in install] == []
 
 

@@ -210,8 +210,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill in the marks; figures lie beside the pages in the site, and beside docs/ in the repository."""
-    return re.sub(r"\]\(\.\./((?:\.\./)*figures/)", r"](\1", expanded(markdown))
+    """Fill in the marks; what lies beside docs/ in the repository lies among the pages in the site."""
+    markdown = expanded(markdown)
+    for place, source in [("figures/", "figures/"), *BORROWED.items()]:
+        markdown = re.sub(rf"\]\(\.\./((?:\.\./)*){re.escape(source)}", rf"](\g<1>{place}", markdown)
+    return markdown
 
 
 def on_page_content(html: str, **_: Any) -> str:

@@ -1,10 +1,10 @@
-"""What the documentation takes from elsewhere: figures, docstrings, the notebook, the changelog (hooks of MkDocs).
+"""Hooks of MkDocs: add to the site what lies outside docs/ (figures, docstrings, the notebook, the changelog).
 
-Pages say where: ``<!-- docstring: NAME -->`` becomes a class's docstring, ``<!-- arguments: NAME -->``
-a table of a dataclass's fields with their defaults, ``<!-- ids -->`` the list of registered environments,
-``<!-- include: PATH -->`` a file of the repository.
+Marks in the pages say where it goes: ``<!-- docstring: NAME -->`` becomes a class's docstring,
+``<!-- arguments: NAME -->`` a table of a dataclass's fields with their defaults, ``<!-- ids -->`` the list of
+registered environments, ``<!-- include: PATH -->`` a file of the repository.
 
-The notebook is kept with its outputs: docs/renew_notebook.py.
+The notebook is stored with its outputs: docs/renew_notebook.py.
 """
 
 import ast
@@ -14,41 +14,111 @@ import functools
 import inspect
 import json
 import re
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import griffe
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 import sd_friction_env
 
 ROOT = Path(__file__).resolve().parent.parent
-BORROWED = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
+BORROWED = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md", "agents.md": "agents/README.md"}
 NOTEBOOK = "tour.ipynb"
+# The folders that a user imports from, as the navigation calls them.
+ROOMS = {
+    "physics": "Physics",
+    "environments": "Environments",
+    "control": "Controllers",
+    "pictures": "Pictures",
+    "learning": "Learning",
+}
 
+_ENTRY_NAMES = r"((?:\*{0,2}\w+, )*\*{0,2}\w+)"
+_SHARED_LINE = re.compile(rf"(?<=\.) {_ENTRY_NAMES}: ")
+_SHARED_ENTRY = re.compile(rf"^    {_ENTRY_NAMES}(: .*(?:\n {{5,}}\S.*)*)", re.M)
 _ROLE = re.compile(r":(?:attr|class|func|meth|mod):<code>([^<]+)</code>")
 
 
-def modules() -> list[str]:
-    """Return the dotted names of all public modules."""
-    paths = sorted((ROOT / "sd_friction_env").glob("**/[!_]*.py"))
+def modules(rooms: Iterable[str] = ROOMS) -> list[str]:
+    """Return the dotted names of the public modules in these folders."""
+    paths = [path for room in rooms for path in sorted((ROOT / "sd_friction_env" / room).glob("**/[!_]*.py"))]
     return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
 
 
+class Described(NamedTuple):
+    """A public name: where it is defined, and the first paragraph of its docstring."""
+
+    full_name: str
+    summary: str
+
+
 @functools.cache
-def public_names() -> dict[str, str]:
-    """Return the full names of modules, classes, methods and functions by what docstrings call them."""
-    names = {}
+def public_names() -> dict[str, Described]:
+    """Return modules, classes, methods and functions by the names that docstrings use for them."""
+    names: dict[str, Described] = {}
+
+    def add(name: str, full_name: str, docstring: str | None) -> None:
+        names[name] = Described(full_name, " ".join((docstring or "").strip().partition("\n\n")[0].split()))
+
     for module in modules():
-        names[module] = module
         tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8"))
+        add(module, module, ast.get_docstring(tree))
         for node in tree.body:
             if isinstance(node, ast.ClassDef | ast.FunctionDef):
-                names[node.name] = f"{module}.{node.name}"
-            if isinstance(node, ast.ClassDef):
-                methods = [part.name for part in node.body if isinstance(part, ast.FunctionDef)]
-                names |= {f"{node.name}.{name}": f"{module}.{node.name}.{name}" for name in methods}
+                add(node.name, f"{module}.{node.name}", ast.get_docstring(node))
+            for part in node.body if isinstance(node, ast.ClassDef) else ():
+                if isinstance(part, ast.FunctionDef):
+                    name = f"{node.name}.{part.name}"
+                    add(name, f"{module}.{name}", ast.get_docstring(part))
+    for name, path in sd_friction_env._PUBLIC.items():
+        if name not in names:  # defined in the kernel, shown where it is imported from
+            add(name, f"sd_friction_env.{path}.{name}", inspect.getdoc(getattr(sd_friction_env, name)))
     return names
+
+
+def overview() -> str:
+    """Return the page of the names that ``sd_friction_env`` offers at its top level, folder by folder."""
+    found = {name: public_names().get(name) for name in sd_friction_env.__all__}
+    found |= {name: public_names()[f"sd_friction_env.{path}"] for name, path in sd_friction_env._MODULES.items()}
+    parts = [
+        "# API",
+        "Import these names from the top level: `from sd_friction_env import simulate`.",
+        "The pages on the left hold everything else, one module each.",
+    ]
+    for room, title in ROOMS.items():
+        parts += [f"## {title}", "| name | what it is |\n|---|---|"]
+        for name, described in found.items():
+            if described and described.full_name.startswith(f"sd_friction_env.{room}."):
+                summary = described.summary.replace("|", "&#124;")
+                parts[-1] += f"\n| [`{name}`][{described.full_name}] | {summary} |"
+    return "\n\n".join(parts)
+
+
+class Entries(griffe.Extension):
+    """Give each name in a docstring an entry of its own, which is how griffe wants them.
+
+    Ours may share a description ("x, v: the state") or a line ("dt: time between samples. hold: of each value").
+    """
+
+    def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+        """Rewrite the docstring of an object."""
+        if obj.docstring is None:
+            return
+        known = set(obj.members) | {parameter.name for parameter in getattr(obj, "parameters", ())}
+
+        def own_line(entry: re.Match[str]) -> str:
+            names = entry[1].replace("*", "").split(", ")
+            return f"\n    {entry[1]}: " if all(name in known or name.endswith("Error") for name in names) else entry[0]
+
+        def own_entry(entry: re.Match[str]) -> str:
+            return "\n".join(f"    {name}{entry[2]}" for name in entry[1].split(", "))
+
+        lines = obj.docstring.value.split("\n")
+        lines = [_SHARED_LINE.sub(own_line, line) if line.startswith("    ") else line for line in lines]
+        obj.docstring.value = _SHARED_ENTRY.sub(own_entry, "\n".join(lines))
 
 
 def attributes_of(kind: type) -> dict[str, str]:
@@ -112,19 +182,24 @@ def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Give every module its place in the navigation."""
-    for entry in config.nav or ():
-        if "API" in entry:
-            entry["API"] = [{module: f"api/{module}.md"} for module in modules()]
+    """Give every module its place in the navigation, below the title of its folder."""
+    for section in config.nav or ():
+        if "API" in section:
+            section["API"] = [{"Overview": "api/index.md"}]
+            for room, title in ROOMS.items():
+                pages = [{module.split(".", 2)[2]: f"api/{module}.md"} for module in modules([room])]
+                section["API"].append({title: pages})
     return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add what lies outside docs/, and the pages that are made."""
-    for path in sorted((ROOT / "figures").glob("*.png")):
-        files.append(File.generated(config, f"figures/{path.name}", abs_src_path=str(path)))
+    """Add what lies outside docs/, and the generated pages."""
+    for path in sorted((ROOT / "figures").iterdir()):
+        if path.suffix in (".png", ".svg", ".gif"):
+            files.append(File.generated(config, f"figures/{path.name}", abs_src_path=str(path)))
     for name, source in BORROWED.items():
         files.append(File.generated(config, name, abs_src_path=str(ROOT / source)))
+    files.append(File.generated(config, "api/index.md", content=overview()))
     for module in modules():
         files.append(File.generated(config, f"api/{module}.md", content=f"::: {module}\n"))
     page, pictures = notebook_page(ROOT / "docs" / NOTEBOOK)
@@ -135,16 +210,19 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill in the marks; figures lie beside the pages in the site, and beside docs/ in the repository."""
-    return re.sub(r"\]\(\.\./((?:\.\./)*figures/)", r"](\1", expanded(markdown))
+    """Fill in the marks; what lies beside docs/ in the repository lies among the pages in the site."""
+    markdown = expanded(markdown)
+    for place, source in [("figures/", "figures/"), *BORROWED.items()]:
+        markdown = re.sub(rf"\]\(\.\./((?:\.\./)*){re.escape(source)}", rf"](\g<1>{place}", markdown)
+    return markdown
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Make links of the roles in docstrings, such as :class:`Task`."""
+    """Turn the roles in docstrings, such as :class:`Task`, into links."""
 
     def link(role: re.Match[str]) -> str:
         target = public_names().get(role[1].lstrip("~"))
         code = f"<code>{role[1]}</code>"
-        return f'<autoref identifier="{target}" optional>{code}</autoref>' if target else code
+        return f'<autoref identifier="{target.full_name}" optional>{code}</autoref>' if target else code
 
     return _ROLE.sub(link, html)

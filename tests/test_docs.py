@@ -33,7 +33,7 @@ def module_in_docs(name):
     return module
 
 
-hooks = module_in_docs("hooks")
+hooks, agents_table = module_in_docs("hooks"), module_in_docs("renew_agents_table")
 PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 
 
@@ -99,7 +99,7 @@ def test_the_scripts_that_a_page_names_take_the_options_that_it_shows(page, comm
 
 def test_every_command_of_the_pages_is_of_a_kind_that_is_checked():
     known = ("sd-friction ", "python scripts/", "python -m rl_zoo3.train ", "FOLDER=$(sd-friction hyperparameters)")
-    install = ("python3 -m venv .venv", '.venv/bin/python -m pip install -c constraints.txt -e ".[all,dev]"')
+    install = ('python -m pip install -e ".[train,plot]"',)
     assert [pair for pair in COMMANDS if not pair[1].startswith(known) and pair[1] not in install] == []
 
 
@@ -117,6 +117,25 @@ def test_the_environment_page_names_all_that_info_holds():
     env.reset(seed=0)
     told = env.step(np.zeros(1, np.float32))[4]
     assert set(re.findall(r"`(\w+)`", " ".join(table))) == set(told)
+
+
+def test_the_table_of_agents_is_current():
+    page = agents_table.PAGE.read_text(encoding="utf-8")
+    assert page == agents_table.renewed(page)
+    runs = {path.name for path in (ROOT / "agents" / "pretrained").iterdir()}
+    assert runs == set(re.findall(r"^\| ([\w-]+) \| `python scripts/train.py", page, re.M))
+
+
+def test_links_of_the_readme_are_absolute_where_the_repository_is_known():
+    standalone = module_in_docs("long_description").standalone
+    page = "![a curve](figures/a.png) [Docs](docs/a.md) [below](#below) [Gymnasium](https://gymnasium.farama.org)"
+    kept = "[below](#below) [Gymnasium](https://gymnasium.farama.org)"
+    assert standalone(page) == f" Docs {kept}"
+    place = "https://example.org/us/it"
+    assert (
+        standalone(page, place)
+        == f"![a curve]({place}/raw/main/figures/a.png) [Docs]({place}/blob/main/docs/a.md) {kept}"
+    )
 
 
 def test_the_argument_tables_show_every_default():
@@ -156,7 +175,8 @@ def site(tmp_path_factory):
 
 
 def test_the_site_has_every_page_and_every_module(site):
-    expected = {page.replace(".md", ".html") for page in PAGES} | {"contributing.html", "changelog.html", "tour.html"}
+    expected = {page.replace(".md", ".html") for page in PAGES} | {"tour.html", "api/index.html"}
+    expected |= {name.replace(".md", ".html") for name in hooks.BORROWED}
     expected |= {f"api/{module}.html" for module in hooks.modules()}
     assert {page for page in expected if not (site / page).is_file()} == set()
     assert not list(site.rglob("*.py"))
@@ -173,6 +193,30 @@ def test_the_site_loads_nothing_from_elsewhere_and_has_no_dead_link(site):
             path = place.partition("#")[0]
             if path and not re.match(r"[a-z]+:", path):
                 assert (page.parent / path).exists(), f"{page.name}: {place}"
+
+
+def test_the_api_has_an_entry_with_its_own_type_for_each_name_that_a_docstring_describes(site):
+    pages = sorted((site / "api").glob("sd_friction_env.physics.orbits*.html"))
+    page = "".join(path.read_text(encoding="utf-8") for path in pages)
+    for name, kind in [
+        ("eigenvalues", "tuple"),
+        ("period", "float"),
+        ("angular_frequency", "float"),
+        ("sticks", "int"),
+    ]:
+        assert re.search(rf">{name}</span></code></b>\s*\(<code><span title=\"{kind}\">", page), name
+
+
+def test_the_overview_of_the_api_names_all_that_the_package_offers_at_its_top_level(site):
+    page = (site / "api" / "index.html").read_text(encoding="utf-8")
+    offered = set(sd_friction_env.__all__) - {"__version__", "ENVIRONMENT_IDS"}
+    assert {name for name in offered if f"<code>{name}</code></a>" not in page} == set()
+
+
+def test_formulas_are_typeset_without_a_server(site):
+    page = (site / "environment.html").read_text(encoding="utf-8")
+    assert page.count('<div class="arithmatex">') >= 4
+    assert 'src="katex/katex.min.js"' in page
 
 
 def test_the_api_shows_docstrings_with_links(site):

@@ -97,7 +97,9 @@ def test_the_metadata_says_what_a_user_must_know(metadata: email.message.Message
     assert metadata["Version"] == VERSION
     assert metadata["Requires-Python"] == ">=3.11"
     assert metadata["License-Expression"] == "MIT"
-    assert str(metadata.get_payload()).strip()  # the README, shown by the package index
+    description = str(metadata.get_payload())  # the README, shown by the package index
+    assert "# sd_friction_env" in description
+    assert not re.search(r"\]\((?!https://|#)", description)  # relative links lead nowhere there
     assert {"plot", "render", "train", "zoo", "all", "dev"} <= set(metadata.get_all("Provides-Extra", []))
 
 

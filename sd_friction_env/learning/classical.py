@@ -450,5 +450,5 @@ def classical_controllers(env_id: str, path: Path | None = None) -> dict[str, Po
     env_id = env_id.rpartition(":")[2]
     found = stored_gains(path).get(env_id)
     if not found:
-        raise NotTunedError(f"no tuned controllers are stored for {env_id!r}: run scripts/tune_classical.py")
+        raise NotTunedError(f"no tuned controllers are stored for {env_id!r}: run sd-friction tune-classical")
     return {name: _with(name, env_id, entry["values"]) for name, entry in found.items()}

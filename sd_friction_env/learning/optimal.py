@@ -792,7 +792,7 @@ def _damaged(path: Path, env_id: str, error: Exception) -> str:
 
 def _command(env_id: str) -> str:
     task, _, randomised = _FILES[env_id].partition("-")
-    return f"python scripts/optimum.py --task {task}" + (" --tier randomised" if randomised else "")
+    return f"sd-friction optimum --task {task}" + (" --tier randomised" if randomised else "")
 
 
 @functools.lru_cache(maxsize=8)

@@ -50,7 +50,7 @@ FORMAT = 1  # of what a study says of itself
 HEARTBEAT = 10  # seconds between a running trial's signs of life; after six without one it is dead, and tried again
 DATABASES = ("sqlite", "postgresql", "mysql")
 PRUNERS = ("median", "hyperband", "none")
-OUT_HEADER = "# The best hyperparameters of a study by scripts/tune.py, in RL Zoo's format."
+OUT_HEADER = "# The best hyperparameters of a study by sd-friction tune, in RL Zoo's format."
 
 _GRACE = 6
 _RETRIES = 3  # of a trial whose process dies; one that was interrupted is always tried again
@@ -849,7 +849,7 @@ def check_out(path: Path) -> None:
 
 
 def write_best(study: optuna.Study, path: Path) -> None:
-    """Write the best trial's hyperparameters for ``scripts/train.py --hyperparameters``, whole or not at all.
+    """Write the best trial's hyperparameters for ``sd-friction train --hyperparameters``, whole or not at all.
 
     Raises:
         ValueError: if no trial is complete, or as :func:`check_out`. OSError: if it cannot be written.

@@ -54,7 +54,9 @@ class Equilibrium:
     """A steady-slip equilibrium: the mass stands still, the belt slides under it (Eq. 11).
 
     Attributes:
-        x: its place. eigenvalues: of the linearised slip motion. stable: whether both have negative real parts.
+        x: where the mass stands.
+        eigenvalues: those of the linearised slip motion.
+        stable: whether both have negative real parts.
     """
 
     x: float

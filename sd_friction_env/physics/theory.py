@@ -181,7 +181,7 @@ def linear_breakaway_x(v_b: Real, mu_s: float, g1: float, beta: float) -> Real:
 def linear_hopf_belt_speed(mu_s: float, mu_m: float, v_m: float, beta: float, g1: float = 1.0) -> float:
     """v_b1 = v_m sqrt(1 - 4 beta v_m/(3 g1 (mu_s - mu_m))), exact on the linear belt; NaN where nothing oscillates.
 
-    Thomsen and Fidlin (2003), the paper's reference [1], as are the three functions below.
+    Thomsen and Fidlin (2003), as are the three functions below.
     """
     difference = mu_s - mu_m
     square = 1.0 - 4.0 * beta * v_m / (3.0 * g1 * difference) if difference > 0.0 else -1.0

@@ -341,7 +341,7 @@ def test_the_script_refuses_what_cannot_be(arguments, message, capsys):
 
 
 def test_foreign_or_missing_gains_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"no tuned controllers are stored for .*: run scripts/tune_classical.py"):
+    with pytest.raises(ValueError, match=r"no tuned controllers are stored for .*: run sd-friction tune-classical"):
         classical.classical_controllers(FORCE, tmp_path / "none.json")
     file = tmp_path / "gains.json"
     entry = {"values": {"gain": 1.0}}

@@ -299,7 +299,7 @@ def test_a_damaged_optimum_is_told_as_such_and_not_as_missing(tmp_path, monkeypa
     (tmp_path / "belt.json").write_text(damage(whole), encoding="utf-8")
     monkeypatch.setattr(optimal, "OPTIMUM_DIRECTORY", tmp_path)
     assert evaluation.optimal_returns(FORCE, [1_000_000]) is None  # here none is stored
-    with pytest.raises(RuntimeError, match=r"belt\.json.* or is damaged .*scripts/optimum\.py --task belt`"):
+    with pytest.raises(RuntimeError, match=r"belt\.json.* or is damaged .*sd-friction optimum --task belt`"):
         evaluation.optimal_returns(BELT, [1_000_000])
     assert main(["evaluate", "--task", "belt", "--episodes", "2"]) == 1
     error = capsys.readouterr().err

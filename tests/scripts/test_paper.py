@@ -1,4 +1,4 @@
-"""The paper's claims against the orbits, one by one: which hold, and by how much the others miss (docs/paper.md)."""
+"""The source paper's claims against the orbits: which hold, and by how much the others miss (docs/reproducing.md)."""
 
 import functools
 import math

@@ -80,7 +80,7 @@ def test_the_readmes_python_runs_as_printed(block, tmp_path):
 
 
 def test_the_readmes_analysis_commands_run_as_printed(tmp_path):
-    commands = re.findall(r"^    \.venv/bin/sd-friction (.*)$", README, re.M)
+    commands = re.findall(r"^    sd-friction (.*)$", README, re.M)
     assert len(commands) >= 5
     assert "explore" in commands  # test_explorer.py runs it
     for command in commands:
@@ -93,7 +93,7 @@ def test_the_readmes_analysis_commands_run_as_printed(tmp_path):
 
 def test_the_readmes_scripts_run_as_printed_but_shorter(tmp_path):
     """Training, then what uses what was trained."""
-    commands = re.findall(r"^    \.venv/bin/python scripts/(\w+\.py) (.+)$", README, re.M)
+    commands = re.findall(r"^    python scripts/(\w+\.py) (.+)$", README, re.M)
     shorter = {
         "train.py": ["--timesteps", "4096", "--no-progress"],
         "evaluate.py": ["--episodes", "2"],
@@ -110,6 +110,11 @@ def test_the_readmes_make_targets_exist():
     assert set(re.findall(r"(?:`|^    )make ([a-z]+)", README, re.M)) <= targets
 
 
-def test_the_readme_is_short_and_shows_the_results_as_reported():
-    assert len(README.splitlines()) < 150
-    assert (ROOT / "figures" / "control-summary.md").read_text(encoding="utf-8") in README
+def test_the_readme_is_short():
+    assert len(README.splitlines()) < 120
+
+
+def test_the_files_that_the_readme_links_to_exist():
+    places = [place for place in re.findall(r"\]\(([^)#]+)", README) if not place.startswith("https://")]
+    assert len(places) > 10
+    assert [place for place in places if not (ROOT / place).is_file()] == []

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sd_friction_env.control.policies import NetworkPolicy, PolicyFileError, load_policy
+from sd_friction_env.control.policies.network import NetworkPolicy, PolicyFileError, load_policy
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.storage import AGENTS
 

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sd_friction_env.control.policies import Policy, State, ZeroPolicy
+from sd_friction_env.control.policies.policy import Policy, State, ZeroPolicy
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.storage import checked_ending
 

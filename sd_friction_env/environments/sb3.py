@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from sd_friction_env.environments.batch import RESET_KEYS, SDFrictionVectorEnv, checked_info_keys
-from sd_friction_env.environments.single import PLAIN_STATISTICS
+from sd_friction_env.environments.batch import SDFrictionVectorEnv
+from sd_friction_env.environments.info import PLAIN_STATISTICS, RESET_KEYS, checked_info_keys
 
 _ENTRY_POINT = f"{SDFrictionVectorEnv.__module__}:{SDFrictionVectorEnv.__name__}"
 

@@ -130,9 +130,11 @@ class SDFrictionVectorEnv(Members):
         self.single_observation_space, self.single_action_space = single.observation_space, single.action_space
         self.observation_space = batch_space(single.observation_space, n)
         self.action_space = batch_space(single.action_space, n)
-        self._info = BatchInfo(n, keys, STEP_KEYS if reward is not None else _PICTURED if self._displays else ())
         self._episodes = Episodes(self.nominal, self.task, n, self.threads)
+        needed = STEP_KEYS if reward is not None else _PICTURED if self._displays else ()
+        self._info = BatchInfo(n, self._episodes.width, keys, needed)
         self._actions = np.zeros(n)
+        self._expected_actions = f"actions must be finite numbers in an array of shape ({n}, 1)"
         self._buffers: Buffers | None = None  # used again if nothing is copied
         self._over = np.zeros(0, np.int64)
         self._seeds: list[int | None] = [None] * n
@@ -188,7 +190,8 @@ class SDFrictionVectorEnv(Members):
         self._restart(which, starts)
         self._over = self._over[~np.isin(self._over, which)]
         info = self._info.reset(which, *self._episodes.start_info(which))
-        return self._observations(), info
+        observations = self._episodes.observations
+        return observations.copy() if self.copy else observations, info
 
     def _apply(self, draft: Draft, options_of_each: Sequence[Mapping[str, Any]]) -> None:
         """Put the parameters and states that options set into a draft."""
@@ -205,10 +208,6 @@ class SDFrictionVectorEnv(Members):
     def _restart(self, which: IntegerArray, starts: Starts | None) -> None:
         self._episodes.restart(which, starts)
         self._clear_displays(which)
-
-    def _observations(self) -> NDArray[np.float32]:
-        observations = self._episodes.observations
-        return observations.copy() if self.copy else observations
 
     def step(
         self, actions: NDArray[np.float32]
@@ -237,7 +236,7 @@ class SDFrictionVectorEnv(Members):
                 "options={'reset_mask': ...} before step()"
             )
         next_starts = self._episodes.next_starts(resting) if len(resting) else None
-        out = self._buffers or self._info.buffers(self._episodes.width)
+        out = self._buffers or self._info.buffers()
         if not self.copy:
             self._buffers = out
         ended = self._episodes.advance(checked, self._info.rows, out)
@@ -258,10 +257,11 @@ class SDFrictionVectorEnv(Members):
             self._end(info, np.flatnonzero(terminated | truncated))
         if self.render_mode == "human":
             self.render()
-        return self._observations(), out.rewards, terminated, truncated, info
+        observations = self._episodes.observations.copy() if self.copy else self._episodes.observations
+        return observations, out.rewards, terminated, truncated, info
 
     def _checked_actions(self, actions: Any) -> FloatArray:
-        expected = f"actions must be finite numbers in an array of shape ({self.num_envs}, 1)"
+        expected = self._expected_actions
         array = real_array(expected, actions)
         if array.shape != (self.num_envs, 1):
             raise ValueError(f"{expected}, got shape {array.shape}")

@@ -112,7 +112,7 @@ class Episodes:
         self._form_groups()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("_groups", "_works")}
+        return {name: value for name, value in vars(self).items() if name not in ("_arrays", "_groups", "_works")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -135,6 +135,7 @@ class Episodes:
         rows = kernel.STATE_PLANT + max(group.steppers.leaves for group in self._groups)
         if len(self.state) < rows:
             self.state = np.concatenate((self.state, np.zeros((rows - len(self.state), self.width))))
+        self._arrays = (self._task_numbers, self._task_codes, self.state, self.counts, self._past, self._shown)
         self._works = np.ones((self.shares, self._groups[0].steppers.work_size))
         self._task_codes[kernel.TASK_ONE_PLANT] = False
 
@@ -148,10 +149,6 @@ class Episodes:
             return [(self._groups[0], which)]
         parts = [(group, which[np.isin(which, group.which)]) for group in self._groups]
         return [(group, members) for group, members in parts if len(members)]
-
-    @property
-    def _arrays(self) -> tuple[Any, ...]:
-        return self._task_numbers, self._task_codes, self.state, self.counts, self._past, self._shown
 
     # Starts -----------------------------------------------------------------------------------------------------------
 
@@ -317,7 +314,7 @@ class Episodes:
             return sum(self._advance_group(group, actions, rows, out) for group in self._groups)
         group = self._groups[0]
         arguments = (*self._arrays, group.tables, actions, rows, self.observations, *out)
-        if self.shares == 1 or _threads_are_lost:
+        if len(self._works) == 1 or _threads_are_lost:
             ended: int = group.steppers.step_many(self._works[0], 0, self.num_envs, *arguments)
             return ended
         group.steppers.step_in_threads(self._works, self._bounds, self._ended, *arguments)

@@ -18,35 +18,26 @@ SMALLEST_BELT_SPEED = 1e-6  # of an environment
 # Parameters -----------------------------------------------------------------------------------------------------------
 
 
-def as_parameters(parameters: Any) -> OscillatorParameters:
-    """Return the parameters that a mapping of names, :class:`OscillatorParameters` or None (the nominal plant) means.
-
-    Raises:
-        TypeError, ValueError: if it is none of these, or a value is not legal in an environment.
-    """
-    if isinstance(parameters, OscillatorParameters):
-        checked = parameters
-    elif parameters is None or isinstance(parameters, Mapping):
-        _check_names("parameters", parameters or {})
-        checked = OscillatorParameters().replace(**(parameters or {}))
-    else:
-        raise TypeError(f"parameters must be OscillatorParameters or a mapping of its fields, got {parameters!r}")
-    check_belt(checked)
-    return checked
+def as_parameters(parameters: OscillatorParameters | Mapping[str, Any] | None) -> OscillatorParameters:
+    """Return :class:`OscillatorParameters`, from a mapping of its fields or None (the nominal plant) too."""
+    if not isinstance(parameters, OscillatorParameters):
+        given = {} if parameters is None else parameters
+        _check_names("parameters", given)
+        parameters = OscillatorParameters().replace(**given)
+    check_belt(parameters)
+    return parameters
 
 
-def _check_names(name: str, parameters: Mapping[Any, Any]) -> None:
+def _check_names(name: str, parameters: Any) -> None:
+    if not isinstance(parameters, Mapping):
+        raise TypeError(f"{name} must be a mapping of parameter names to values, got {parameters!r}")
     for key in parameters:
         if not isinstance(key, str):
             raise TypeError(f"{name} must map parameter names to values, got the name {key!r}")
 
 
 def check_belt(parameters: OscillatorParameters) -> None:
-    """Refuse a belt too slow for an environment.
-
-    Raises:
-        ValueError: if the belt speed is less than ``SMALLEST_BELT_SPEED``.
-    """
+    """Raise ValueError if the belt is too slow for an environment."""
     if parameters.belt_speed < SMALLEST_BELT_SPEED:
         raise ValueError(
             f"belt_speed must be at least {SMALLEST_BELT_SPEED:g} in an environment, whose reward is relative to it, "
@@ -55,11 +46,7 @@ def check_belt(parameters: OscillatorParameters) -> None:
 
 
 def check_ranges(task: Task, nominal: OscillatorParameters) -> None:
-    """Refuse ranges of randomised parameters in which an episode could draw illegal ones.
-
-    Raises:
-        ValueError: if the most demanding corner of the ranges is not legal.
-    """
+    """Raise ValueError if an episode could draw parameters that are not legal."""
     corner = {name: low for name, (low, _) in task.randomise.items()}
     for name in {"mu_m", "mu_k"} & corner.keys():
         corner[name] = task.randomise[name][1]  # the largest, with the smallest mu_s
@@ -75,11 +62,7 @@ def without_axes(value: Any) -> Any:
 
 
 def checked_options(options: Any) -> dict[str, Any]:
-    """Return the options of one environment, checked.
-
-    Raises:
-        TypeError, ValueError: naming the option, its value and what is allowed.
-    """
+    """Return the options of one environment; raise TypeError or ValueError if one is not legal."""
     if options is None:
         return {}
     if not isinstance(options, Mapping):
@@ -90,13 +73,9 @@ def checked_options(options: Any) -> dict[str, Any]:
     checked = {name: without_axes(value) for name, value in options.items()}
     if "parameters" in checked:
         given = checked["parameters"]
-        if isinstance(given, OscillatorParameters):
-            checked["parameters"] = dataclasses.asdict(given)
-        elif not isinstance(given, Mapping):
-            raise TypeError(f"options['parameters'] must map parameter names to values, got {given!r}")
-        else:
-            _check_names("options['parameters']", given)
-            checked["parameters"] = {name: without_axes(value) for name, value in given.items()}
+        given = dataclasses.asdict(given) if isinstance(given, OscillatorParameters) else given
+        _check_names("options['parameters']", given)
+        checked["parameters"] = {name: without_axes(value) for name, value in given.items()}
     for name in ("x", "v"):
         if name in checked:
             checked[name] = checked_number(f"options[{name!r}]", checked[name], -STATE_LIMIT, STATE_LIMIT)
@@ -112,11 +91,7 @@ def checked_options(options: Any) -> dict[str, Any]:
 def apply_options(
     task: Task, parameters: OscillatorParameters, options: Mapping[str, Any], key: int, episode: int
 ) -> tuple[OscillatorParameters, tuple[float, float] | None]:
-    """Return an episode's parameters, and its (x, v) if the (checked) options set them.
-
-    Raises:
-        TypeError, ValueError: if a parameter or ``start`` is not legal.
-    """
+    """Return an episode's parameters, and its (x, v) if the (checked) options set them."""
     if "parameters" in options:
         parameters = parameters.replace(**options["parameters"])
         check_belt(parameters)
@@ -130,11 +105,7 @@ def apply_options(
 
 
 def checked_batch_options(options: Any, num_envs: int) -> tuple[NDArray[np.bool_] | None, list[dict[str, Any]] | None]:
-    """Return the mask of environments to be reset (None: all) and the checked options of each (None: no options).
-
-    Raises:
-        TypeError, ValueError: naming the option, its value and what is allowed.
-    """
+    """Return the mask of environments to be reset (None: all) and the checked options of each (None: no options)."""
     if options is None:
         return None, None
     if isinstance(options, Sequence) and not isinstance(options, str):
@@ -153,21 +124,20 @@ def checked_batch_options(options: Any, num_envs: int) -> tuple[NDArray[np.bool_
             raise ValueError(f"{expected}, got shape {mask.shape} with {mask.sum()} True")
     if not given:
         return mask, None
-    parameters = given.get("parameters")
-    if isinstance(parameters, Sequence) and not isinstance(parameters, str) and len(parameters) != num_envs:
-        raise ValueError(f"options['parameters'] must be a mapping or {num_envs} of them, got {len(parameters)}")
-    columns = {name: _entries(f"options[{name!r}]", value, num_envs) for name, value in given.items()}
-    if isinstance(parameters, Mapping):
-        named = {
-            name: _entries(f"options['parameters'][{name!r}]", value, num_envs) for name, value in parameters.items()
-        }
-        columns["parameters"] = [{name: entries[i] for name, entries in named.items()} for i in range(num_envs)]
-    return mask, [checked_options({name: entries[i] for name, entries in columns.items()}) for i in range(num_envs)]
+    return mask, [checked_options(single) for single in _transposed("options", given, num_envs)]
+
+
+def _transposed(name: str, values: Mapping[Any, Any], num_envs: int) -> list[dict[Any, Any]]:
+    """Return a mapping for each environment, from a mapping to values for all or arrays of ``num_envs`` values."""
+    columns = {key: _entries(f"{name}[{key!r}]", value, num_envs) for key, value in values.items()}
+    return [{key: entries[i] for key, entries in columns.items()} for i in range(num_envs)]
 
 
 def _entries(name: str, value: Any, num_envs: int) -> list[Any]:
     """Return an option's value for each environment: the entries of an array, or one value for all."""
     value = without_axes(value)
+    if isinstance(value, Mapping):
+        return _transposed(name, value, num_envs)
     if not isinstance(value, np.ndarray | list | tuple) or _is_law(value):
         return [value] * num_envs
     if isinstance(value, np.ndarray) and value.ndim > 1:
@@ -189,11 +159,7 @@ def _is_law(value: Any) -> bool:
 
 
 def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
-    """Return the seed of each environment.
-
-    Raises:
-        TypeError, ValueError: if ``seed`` is neither None, a whole number, nor ``num_envs`` of these.
-    """
+    """Return the seed of each environment, from None, a whole number or ``num_envs`` of these."""
     if seed is None:
         return [None] * num_envs
     listed = isinstance(seed, Sequence) and not isinstance(seed, str | bytes | bytearray | memoryview)
@@ -217,8 +183,8 @@ def real_array(expected: str, values: Any) -> NDArray[Any]:
     """Return real numbers as an array, float32 or float64.
 
     Raises:
-        TypeError: if they are not real numbers (text, complex numbers and times are not) or form no array.
-        ValueError: if one exceeds the largest float. Both messages begin with ``expected``.
+        TypeError, ValueError: if they form no array, are text, complex numbers or times, or exceed the largest float;
+            the message begins with ``expected``.
     """
     try:
         array = np.asarray(values)
@@ -237,11 +203,7 @@ def real_array(expected: str, values: Any) -> NDArray[Any]:
 
 
 def clipped_action(action: Any) -> float:
-    """Return an action, any array or sequence of one finite number, clipped to [-1, 1].
-
-    Raises:
-        TypeError, ValueError: if it is not one finite number in an array of shape (1,).
-    """
+    """Return an action, any array or sequence of one finite number, clipped to [-1, 1]."""
     expected = "action must be one finite number in an array of shape (1,)"
     array = real_array(expected, action)
     if array.shape != (1,):

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-import numbers
+import sys
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from sd_friction_env import kernel
 from sd_friction_env.environments.options import check_belt
 from sd_friction_env.environments.task import FloatArray, IntegerArray
-from sd_friction_env.physics.parameters import OscillatorParameters, brief_repr
+from sd_friction_env.physics.parameters import OscillatorParameters, brief_repr, checked_number
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,16 +86,8 @@ def check_state(name: str, state: Any) -> None:
         raise TypeError(f"{name}.ended must be True or False, got {state.ended!r}")
     for field in ("x", "v", "v_belt", "belt_travel", "worst_cost"):
         value = getattr(state, field)
-        if type(value) is float and math.isfinite(value):  # the usual case, checked fast
-            continue
-        if isinstance(value, bool) or not isinstance(value, numbers.Real):
-            raise TypeError(f"{name}.{field} must be a real number, got {brief_repr(value)}")
-        try:
-            legal = math.isfinite(value) or state.ended
-        except OverflowError:
-            legal = False
-        if not legal:
-            raise ValueError(f"{name}.{field} must be finite, got {brief_repr(value)}")
+        if not isinstance(value, float) or not (state.ended or math.isfinite(value)):
+            checked_number(f"{name}.{field}", value, -sys.float_info.max, sys.float_info.max)
     for field in ("steps", "key", "episode"):
         value = getattr(state, field)
         if isinstance(value, bool) or not isinstance(value, int | np.integer):

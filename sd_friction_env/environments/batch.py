@@ -36,9 +36,9 @@ class SDFrictionVectorEnv(Members):
     """
     ## Description
 
-    ``num_envs`` environments of the kind :class:`SDFrictionEnv` describes, stepped together: ``gym.make_vec(id,
-    num_envs=...)``. Environment i does bit for bit what the single environment does that is reset with the same seed,
-    whatever ``num_envs``, its place in the batch and the number of threads.
+    ``num_envs`` environments of :class:`SDFrictionEnv`, stepped together in compiled code: ``gym.make_vec(id,
+    num_envs=...)``. Environment i matches the single environment with the same seed bit for bit, whatever
+    ``num_envs``, its position in the batch and the number of threads.
 
     ## Action Space, Observation Space, Rewards, Starting State, Episode End
 
@@ -46,45 +46,44 @@ class SDFrictionVectorEnv(Members):
 
     ## Seeds
 
-    ``reset(seed=7)`` seeds environment i with 7 + i, ``reset(seed=[...])`` with what the list says (None: not at
-    all).
+    ``reset(seed=7)`` seeds environment i with 7 + i; ``reset(seed=[...])`` with entry i of the list (None: no new
+    seed).
 
     ## Options
 
-    Those of :class:`SDFrictionEnv`; each value may also be an array (num_envs,), one entry per environment, and
-    ``parameters`` a mapping of names to numbers or to such arrays, or a sequence of ``num_envs`` mappings. They hold
-    for the episodes that this reset starts. A sequence of ``num_envs`` mappings says it for each on its own.
-    ``reset_mask``, a boolean array (num_envs,), says which environments are
-    reset; the others go on.
+    The options of :class:`SDFrictionEnv`, for the episodes that this reset starts. Each value may also be an array
+    (num_envs,) with one entry per environment; ``parameters`` a mapping of names to numbers or such arrays, or a
+    sequence of ``num_envs`` mappings. A sequence of ``num_envs`` mappings gives each environment its own options.
+    ``reset_mask``, a boolean array (num_envs,), selects the environments to be reset; the others go on.
 
     ## Info
 
-    A dictionary of arrays as Gymnasium's own vector environments have it: beside each array "name" stands a mask
-    "_name" (all masks that are true throughout are one read-only array). ``reset`` tells everything; a step tells the
-    ``info_keys``, by default the reward's terms, for at this speed all else costs more than it is worth
-    to most: ``info_keys="all"`` tells what the single environment tells. Of environments that are reset within a step
-    it tells what ``reset`` tells. When episodes end, ``statistics`` holds their return, length, late amplitude and so
-    on, and the first four also stand beside it. All values are numbers (see :class:`SDFrictionEnv`).
+    A dictionary of arrays in Gymnasium's form: beside each array "name" is a mask "_name" (masks that are true
+    throughout are one read-only array). ``reset`` reports everything. A step reports ``info_keys``, by default the
+    reward terms, because writing all values takes longer than the step itself; ``info_keys="all"`` reports what the
+    single environment reports. For environments that are reset within a step, info has what ``reset`` reports. When
+    episodes end, ``statistics`` has their return, length, late amplitude and so on; the first four are also entries of
+    info itself. All values are numbers (see :class:`SDFrictionEnv`).
 
     ## Arguments
 
     num_envs: in [1, 2**24].
     parameters, reward, and every field of :class:`Task`: as of :class:`SDFrictionEnv`. A ``reward`` function is called
-        once per environment and step: slow; an array expression of ``info`` in a vector wrapper is not.
+        once per environment and step, which is slow; an array expression of ``info`` in a vector wrapper is fast.
     autoreset_mode: "NextStep" (the default), "SameStep" or "Disabled" (https://farama.org/Vector-Autoreset-Mode).
-    threads: how many threads may share a step, in [1, 256]; batches of fewer than 512 environments per thread use
-        fewer. More than 1 pays where that many cores are idle. A process that is forked after threads have run steps
-        on one (start processes by "spawn" or "forkserver" to have threads in them).
-    max_episode_steps: as of ``gym.make``: takes the place of ``episode_steps``; if both are given, the shorter holds.
-        None or -1: no limit of its own.
-    copy: True hands out new arrays at every step. False: they are overwritten by the next step (a little faster).
-    info_keys: "all", or which names of the single environment's info a step tells.
+    threads: largest number of threads that share a step, in [1, 256]; each has at least 512 environments. More than 1
+        pays where that many cores are idle. A process forked after threads have run uses one thread (start processes
+        by "spawn" or "forkserver" to have threads in them).
+    max_episode_steps: as of ``gym.make``: replaces ``episode_steps``; if both are given, the smaller one applies. None
+        or -1: no limit of its own.
+    copy: True returns new arrays at every step. False: the next step overwrites them (slightly faster).
+    info_keys: "all", or the names of the single environment's info that a step reports.
     render_mode: "rgb_array" (:meth:`render` returns a tuple of frames) or "human" (a window for one environment).
     render_size: of a frame, as of :class:`SDFrictionEnv`.
-    render_envs: which environments are drawn; None: the first 16 (of "human": the first).
+    render_envs: positions of the environments that are drawn; None: the first 16 (of "human": the first).
 
     Raises:
-        TypeError, ValueError: if an argument is not as said, naming it and what is allowed.
+        TypeError, ValueError: if an argument has the wrong type or is out of range.
     """
 
     metadata: dict[str, Any] = {**SDFrictionEnv.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012

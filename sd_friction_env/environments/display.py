@@ -16,16 +16,7 @@ READOUT_INTERVALS = 100  # window of the amplitude and stick readouts, in contro
 
 
 class Display:
-    """Picture of one environment.
-
-    Args:
-        task: of the environment.
-        render_mode: "human" (a window) or "rgb_array" (frames).
-        size: width and height in pixels.
-
-    Raises:
-        ValueError: if there is no such mode.
-    """
+    """Picture of one environment, in a window ("human") or as frames ("rgb_array") of a size in pixels."""
 
     def __init__(self, task: Task, render_mode: str, size: tuple[int, int]) -> None:
         self._task = task

@@ -96,8 +96,9 @@ class Episodes:
         # Rows of an odd number of cache lines: rows of a power of two would compete for few places of the cache.
         self.width = n if n < kernel.LANES else 8 * (2 * (n // 16) + 3)
         self.state = np.zeros((kernel.STATE_PLANT, self.width))
+        self.state[kernel.STATE_BELT] = nominal.belt_speed
         self.counts = np.zeros((kernel.COUNT_ROWS, self.width), np.int64)
-        self._numbers = np.zeros((len(self._plants.names), n))
+        self._numbers = np.repeat(self._plants.nominal_column, n, axis=1)
         self._laws = np.zeros(n, np.int64)
         self._past = np.zeros((task.sensor_delay + 1 if task.sensor_delay else 0, 2, n))
         self._shown = np.zeros((n, len(task.shown)))
@@ -118,11 +119,6 @@ class Episodes:
         vars(self).update(state)
         self._form_groups()  # compiled code is not copied
 
-    @property
-    def shares(self) -> int:
-        """Number of threads that share a step."""
-        return len(self._ended)
-
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays that hold the state of all episodes, not copies, by name."""
         return {name: value for name, value in self.__getstate__().items() if isinstance(value, np.ndarray)}
@@ -136,7 +132,7 @@ class Episodes:
         if len(self.state) < rows:
             self.state = np.concatenate((self.state, np.zeros((rows - len(self.state), self.width))))
         self._arrays = (self._task_numbers, self._task_codes, self.state, self.counts, self._past, self._shown)
-        self._works = np.ones((self.shares, self._groups[0].steppers.work_size))
+        self._works = np.ones((len(self._ended), self._groups[0].steppers.work_size))
         self._task_codes[kernel.TASK_ONE_PLANT] = False
 
     def _group(self, kind: Kind, which: IntegerArray) -> _Group:

@@ -10,16 +10,11 @@ from sd_friction_env import kernel
 from sd_friction_env.environments.task import FloatArray, IntegerArray
 from sd_friction_env.physics.parameters import FRICTIONS, GEOMETRIES, OscillatorParameters, checked_choice
 
-EPISODE_STATISTICS = (
-    "return",
-    "length",
-    "late_amplitude",
-    "late_stick_fraction",
-    "reward_vibration",
-    "reward_effort",
-    "reward_stick",
-    "reward_contact_loss",
-)
+REWARD_TERMS = ("reward_vibration", "reward_effort", "reward_stick", "reward_contact_loss")
+# Statistics of an episode, in the kernel's order. Its last info also has the plain ones at the top level, where
+# monitors look for them; the others have the names of a step's reward terms.
+PLAIN_STATISTICS = ("return", "length", "late_amplitude", "late_stick_fraction")
+EPISODE_STATISTICS = (*PLAIN_STATISTICS, *REWARD_TERMS)
 # Names of a step's info in its order, and the rows in which the kernel reports them.
 _ROWS = {
     "x": kernel.LANE_X_END,
@@ -50,20 +45,12 @@ _FLOATS = tuple(name for name in _ROWS if name not in (*_CODES, "status"))
 STEP_KEYS = (*_FLOATS, *_CODES, "status")
 RESET_KEYS = ("x", "v", "v_belt", "v_rel", "mode", "normal_force", "time")
 INFO_KEYS = (*STEP_KEYS, "parameters")
-REWARD_TERMS = ("reward_vibration", "reward_effort", "reward_stick", "reward_contact_loss")
 _STEP_INFO: dict[str, Any] = {name: 0.0 if name in _FLOATS else 0 for name in _ROWS}
 new_step_info = _STEP_INFO.copy  # a copy is much faster than a new dictionary
-# Statistics of an episode that its last info also holds at the top level, where monitors look for them; the others have
-# the names of a step's reward terms.
-PLAIN_STATISTICS = tuple(name for name in EPISODE_STATISTICS if name not in _ROWS)
 
 
 def checked_info_keys(info_keys: Any) -> frozenset[str]:
-    """Return the names that a step's info holds.
-
-    Raises:
-        TypeError, ValueError: if ``info_keys`` is neither "all" nor a sequence or a set of names of ``INFO_KEYS``.
-    """
+    """Return the names that a step's info holds, from "all" or a sequence or set of names of ``INFO_KEYS``."""
     expected = "info_keys must be 'all' or a sequence of names"
     if isinstance(info_keys, str):
         if info_keys == "all":

@@ -73,8 +73,7 @@ class Members(LengthInSpec, VectorEnv[NDArray[np.float32], NDArray[np.float32], 
         self._over = np.union1d(self._over[~np.isin(self._over, which)], which[over])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays that hold the state of the batch, by name. They are not copies: written back into a batch
-        made alike, they resume it."""
+        """Return the arrays of the batch's state, not copies, by name: filled with saved values, they resume it."""
         return self._episodes.arrays()
 
     # Methods and attributes -------------------------------------------------------------------------------------------
@@ -85,9 +84,8 @@ class Members(LengthInSpec, VectorEnv[NDArray[np.float32], NDArray[np.float32], 
         A single environment takes the state of each in turn; changes of the state are kept.
 
         Raises:
-            AttributeError: if an environment has nothing of that name.
-            gymnasium.error.ResetNeeded: before the first reset, if the call needs or makes a state.
-            ValueError: if it draws an environment that is not in ``render_envs``.
+            AttributeError: if there is nothing of that name. ValueError: if it draws an environment that is not drawn.
+            gymnasium.error.ResetNeeded: before the first reset, if the call needs or changes a state.
         """
         return tuple(self.call_at(range(self.num_envs), name, *args, **kwargs))
 
@@ -107,18 +105,13 @@ class Members(LengthInSpec, VectorEnv[NDArray[np.float32], NDArray[np.float32], 
         if indices is None:
             return list(range(self.num_envs))
         several: Any = indices if isinstance(indices, Iterable) and getattr(indices, "ndim", 1) > 0 else [indices]
-        places = []
-        for index in several:
-            try:
-                places.append(range(self.num_envs)[operator.index(index)])
-            except TypeError:
-                raise TypeError(
-                    f"indices must be None, a whole number or several of them, got {brief_repr(index)}"
-                ) from None
-            except IndexError:
-                n = self.num_envs
-                raise IndexError(f"indices must be in [{-n}, {n - 1}], got {brief_repr(index)}") from None
-        return places
+        n, got = self.num_envs, f"got {brief_repr(indices)}"
+        try:
+            return [range(n)[operator.index(index)] for index in several]
+        except TypeError:
+            raise TypeError(f"indices must be None, a whole number or several of them, {got}") from None
+        except IndexError:
+            raise IndexError(f"indices must be in [{-n}, {n - 1}], {got}") from None
 
     def _call_one(self, name: str, i: int, /, *args: Any, **kwargs: Any) -> Any:
         if name == "render":
@@ -146,13 +139,7 @@ class Members(LengthInSpec, VectorEnv[NDArray[np.float32], NDArray[np.float32], 
         return getattr(self._single, name)
 
     def attributes_at(self, indices: int | Iterable[int] | None, name: str) -> list[Any]:
-        """Return an attribute of some of the environments; ``indices`` as in :meth:`places`.
-
-        Methods are returned, not called; each acts on its own environment.
-
-        Raises:
-            AttributeError: if an environment has nothing of that name.
-        """
+        """Return an attribute of some of the environments; methods are not called and act on their own environment."""
         found = []
         for i in self.places(indices):
             value = self._attribute(name, i)
@@ -169,8 +156,7 @@ class Members(LengthInSpec, VectorEnv[NDArray[np.float32], NDArray[np.float32], 
 
         Raises:
             ValueError: if there are not ``num_envs`` values.
-            AttributeError: if environments have such an attribute already: it is set for the whole batch, by the
-                constructor or by the options of reset().
+            AttributeError: if environments have such an attribute already.
         """
         listed = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
         if len(listed) != self.num_envs:
@@ -179,15 +165,7 @@ class Members(LengthInSpec, VectorEnv[NDArray[np.float32], NDArray[np.float32], 
             self.set_attr_at([i], name, value)
 
     def set_attr_at(self, indices: int | Iterable[int] | None, name: str, value: Any) -> None:
-        """Set an attribute of some of the environments; a new attribute is None in the others.
-
-        Args:
-            indices: as in :meth:`places`.
-            name, value: of the attribute.
-
-        Raises:
-            AttributeError: as :meth:`set_attr`.
-        """
+        """:meth:`set_attr` for some of the environments, with one value; a new attribute is None in the others."""
         places = self.places(indices)
         if hasattr(self._single, name):
             raise AttributeError(
@@ -212,8 +190,7 @@ class Members(LengthInSpec, VectorEnv[NDArray[np.float32], NDArray[np.float32], 
             return self._single.render()
         if i not in self._displays:
             raise ValueError(f"environment {i} is not drawn: render_envs names {sorted(self._displays)!r}")
-        state = self._episodes.read(i) if self._is_reset else self._single.drawn_state
-        return self._displays[i].draw(state, self._single.title)
+        return self._displays[i].draw(self._episodes.read(i), self._single.title)
 
     def _clear_displays(self, which: IntegerArray) -> None:
         if self._displays:
@@ -227,12 +204,7 @@ class Members(LengthInSpec, VectorEnv[NDArray[np.float32], NDArray[np.float32], 
 
 
 def displays(single: SDFrictionEnv, num_envs: int, render_mode: str | None, render_envs: Any) -> dict[int, Display]:
-    """Return the pictures of a batch's environments by position: of ``render_envs``, or of the first ones if None.
-
-    Raises:
-        TypeError, ValueError: if ``render_envs`` is neither None nor positions, each once and one for "human", or there
-            is no such ``render_mode``.
-    """
+    """Return the pictures of a batch's environments by position: of ``render_envs``, or of the first ones if None."""
     if render_envs is None:
         render_envs = range(min(num_envs, _MOST_RENDERED if render_mode == "rgb_array" else 1))
     elif not isinstance(render_envs, Iterable):

@@ -31,27 +31,27 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
     """
     ## Description
 
-    A mass on an inclined spring rides on a moving belt. Dry friction that falls with speed (Stribeck) makes it squeal:
-    it sticks to the belt, breaks away, slips back and sticks again. The controller pushes the mass with a small force,
-    or changes the belt's speed a little, to make it stand still on the sliding belt. The motion is integrated
-    event-exactly: while the mass sticks its velocity equals the belt's, to the bit.
+    A mass on an inclined spring rides on a moving belt. Its dry friction falls with the sliding speed (Stribeck effect)
+    and excites stick-slip vibration: the mass sticks to the belt, breaks away, slips back and sticks again. The agent
+    applies a small force to the mass, or varies the belt speed slightly, to hold the mass still on the sliding belt.
+    Events are located exactly: while the mass sticks, its velocity equals the belt's bit for bit.
 
-    All quantities are dimensionless: lengths in units of the free spring length, time in units of 1/omega0. Source:
+    All quantities are dimensionless: length in units of the free spring length, time in units of 1/omega0. The model is
     the self-excited smooth-and-discontinuous (SD) oscillator, Eqs. 4-8, with the stick condition
     |a_belt + 2 beta v_belt + R(x) - u| <= mu_s N(x).
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`. A finite action outside the box is clipped to it; NaN and infinity are refused.
+    `Box(-1, 1, (1,), float32)`. A finite action outside the box is clipped; NaN and infinity raise an error.
 
     | actuator | meaning of action a |
     |---|---|
-    | `force` | control force u = `force_limit` a, held over the control interval |
-    | `belt_speed` | the belt heads for (1 + `belt_authority` a) v_b, at most `belt_acceleration_limit` fast |
+    | `force` | control force u = `force_limit` a, constant over the control interval |
+    | `belt_speed` | target (1 + `belt_authority` a) v_b of the belt speed, approached by `belt_acceleration_limit` |
 
     ## Observation Space
 
-    `Box(-observation_limit, observation_limit, (n,), float32)`, clipped to it; raw values are in `info`.
+    `Box(-observation_limit, observation_limit, (n,), float32)`, clipped to the box; raw values are in `info`.
 
     | entry | value | present |
     |---|---|---|
@@ -59,50 +59,50 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
     | velocity | v / v_scale | sensor `state` |
     | belt modulation | (v_belt / belt_speed - 1) / belt_authority | sensor `state` and actuator `belt_speed` |
     | phases | cosine and sine of each excitation's phase: force, ripple, stiffness | `show_phases` |
-    | parameters | each randomised one, its range scaled to [-1, 1], by name | `show_parameters` |
+    | parameters | each randomised parameter, its range scaled to [-1, 1], by name | `show_parameters` |
 
     ## Rewards
 
-    Minus the running cost, averaged over the control interval by the integrator:
-    -( mean v^2 / belt_speed^2 + `w_effort` a^2 + `w_stick` (fraction of the interval stuck) ), where belt_speed is the
-    episode's nominal one. The terms stand in `info` as `reward_vibration`, `reward_effort`, `reward_stick` and
-    `reward_contact_loss`; `reward`, a function of that dictionary, replaces their sum.
+    The reward is minus the cost averaged over the control interval,
+    -( mean v^2 / belt_speed^2 + `w_effort` a^2 + `w_stick` (stick fraction) ), with the episode's nominal belt speed.
+    `info` has the terms as `reward_vibration`, `reward_effort`, `reward_stick` and `reward_contact_loss`. A function
+    `reward` of that dictionary replaces their sum.
 
-    With an episode's last step `info["statistics"]` holds its `return`, its `length`, `late_amplitude` and
-    `late_stick_fraction` (over the last quarter of the time an episode has; NaN if it did not come so far) and the sums
-    of the four terms. The first four also stand in `info` itself, where monitors look for them.
+    After an episode's last step, `info["statistics"]` has its `return`, `length`, `late_amplitude` and
+    `late_stick_fraction` (over the last quarter of `episode_steps`; NaN if the episode ended before) and the sums of
+    the four terms. The first four are also entries of `info` itself, where monitors look for them.
 
     ## Info
 
-    All values are numbers, so that wrappers can make tensors of them; where they stand for names:
+    All values are numbers, so that wrappers can convert them to tensors. Some stand for names:
 
     | entry | number | name |
     |---|---|---|
-    | `mode` | -1, 0, 1 | slips slower than the belt, sticks, slips faster than the belt |
+    | `mode` | -1, 0, 1 | slip slower than the belt, stick, slip faster than the belt |
     | `status` | 0, 1, 2, 3 | ok, contact lost, event limit, step limit (`kernel.STATUS_NAMES`) |
-    | `parameters`: `geometry` | 0 to 3, -1 | place in `parameters.GEOMETRIES`; one of your own |
-    | `parameters`: `friction` | 0 to 4, -1 | place in `parameters.FRICTIONS`; one of your own |
+    | `parameters`: `geometry` | 0 to 3, -1 | position in `parameters.GEOMETRIES`; user-defined |
+    | `parameters`: `friction` | 0 to 4, -1 | position in `parameters.FRICTIONS`; user-defined |
 
-    `env.unwrapped.parameters` are the episode's :class:`OscillatorParameters` themselves.
+    `env.unwrapped.parameters` returns the episode's :class:`OscillatorParameters`.
 
     ## Starting State
 
-    `start`: a random phase of the passive limit cycle (`cycle`), the unloaded spring's place of rest (`rest`) or a
+    `start`: a random phase of the passive limit cycle (`cycle`), the equilibrium of the unloaded spring (`rest`) or a
     random state (`random`). `reset(options=...)` takes
 
     | option | meaning |
     |---|---|
-    | `parameters` | mapping of parameter names to values for this episode (wins over randomisation) |
+    | `parameters` | mapping of parameter names to values for this episode; overrides randomisation |
     | `start` | as the argument |
     | `phase` | phase in [0, 1] of the passive limit cycle, from breakaway |
-    | `x`, `v` | the state itself, each in [-10, 10]; v defaults to the belt speed |
+    | `x`, `v` | initial state, each in [-10, 10]; v defaults to the belt speed |
 
     ## Episode End
 
-    Terminated if the mass loses contact with the belt (N <= 0), at a cost of the steps left times the worst cost per
-    step (at least `contact_loss_cost`). Truncated after `episode_steps` intervals, or if the integrator gives up
-    (`info["status"]`: event or step limit). `max_episode_steps` of `gym.make` (a `TimeLimit` around the environment)
-    takes the place of `episode_steps`; if both are given, the shorter holds.
+    Termination: the mass loses contact with the belt (N <= 0). It costs the remaining steps times the largest cost per
+    step of the episode, which is taken to be at least `contact_loss_cost`. Truncation: after `episode_steps` control
+    intervals, or if the integrator stops (`info["status"]`: event or step limit). `max_episode_steps` of `gym.make` (a
+    `TimeLimit` wrapper) replaces `episode_steps`; if both are given, the smaller one applies.
 
     ## Arguments
 
@@ -153,10 +153,9 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
         self._observations = np.zeros((1, size), np.float32)
         # All arrays are views of one: each array passed to compiled code makes the call slower.
         self._head = kernel.memory_size(task.sensor_delay, len(task.shown))
-        self._memory = np.zeros(self._head)
         numbers, codes = task.arrays()
-        self._memory[: len(numbers)] = numbers
-        self._memory[len(numbers) : len(numbers) + len(codes)].view(np.int64)[:] = codes
+        zeros = np.zeros(self._head - len(numbers) - len(codes))
+        self._memory = np.concatenate((numbers, codes.view(np.float64), zeros))
         self._use(self.nominal)
 
     @classmethod
@@ -321,11 +320,9 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
         """
         if self._key is None:
             raise gym.error.ResetNeeded("call reset() before get_state(): there is no state yet")
-        return self.drawn_state
+        return self._read()
 
-    @property
-    def drawn_state(self) -> EnvState:
-        """State that :meth:`render` draws; before the first reset that of a mass at x = 0, v = 0."""
+    def _read(self) -> EnvState:
         return read_state(self._parameters, self._state, self._counts, self._past, 0)
 
     def set_state(self, state: EnvState) -> None:
@@ -347,7 +344,7 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
         if self._display is None:
             gym.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array' or 'human'")
             return None
-        return self._display.draw(self.drawn_state, self.title)
+        return self._display.draw(self._read(), self.title)
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -244,8 +244,8 @@ def test_threads_change_no_bit(num_envs):
 
 def test_a_small_batch_has_no_use_for_threads():
     envs = batch(num_envs=1000, threads=8).unwrapped
-    assert envs._episodes.shares == 1
-    assert batch(num_envs=2048, threads=8).unwrapped._episodes.shares == 4
+    assert len(envs._episodes._works) == 1
+    assert len(batch(num_envs=2048, threads=8).unwrapped._episodes._works) == 4
 
 
 def mixed_steps(total, seed):

@@ -4,6 +4,7 @@ import collections
 from collections.abc import Mapping
 from typing import Any
 
+from sd_friction_env import kernel
 from sd_friction_env.environments.states import EnvState
 from sd_friction_env.environments.task import Task
 from sd_friction_env.physics.orbits import stick_intervals
@@ -25,7 +26,7 @@ class Display:
         self._renderer: Any = None
         self._window: collections.deque[tuple[float, float, float]] = collections.deque(maxlen=READOUT_INTERVALS)
         self._force = 0.0
-        self.mode: int | None = None  # of the last step; None: that of the undriven mass
+        self.mode: int | None = kernel.STICK  # of the last step; None: that of the undriven mass
 
     def note(self, info: Mapping[str, Any]) -> None:
         """Add a control interval, by its step's info, to the readouts."""

@@ -15,7 +15,8 @@ if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out f
     from sd_friction_env.environments.batch import SDFrictionVectorEnv
     from sd_friction_env.environments.callbacks import AnnealedExploration
     from sd_friction_env.environments.sb3 import SDFrictionVecEnv
-    from sd_friction_env.environments.single import EnvState, SDFrictionEnv
+    from sd_friction_env.environments.single import SDFrictionEnv
+    from sd_friction_env.environments.states import EnvState
     from sd_friction_env.environments.task import Task
     from sd_friction_env.environments.wrappers import ScaledReward
     from sd_friction_env.physics import forced, sweeps, theory
@@ -58,7 +59,7 @@ _PUBLIC = {
     "SDFrictionVectorEnv": "environments.batch",
     "AnnealedExploration": "environments.callbacks",
     "SDFrictionVecEnv": "environments.sb3",
-    "EnvState": "environments.single",
+    "EnvState": "environments.states",
     "SDFrictionEnv": "environments.single",
     "Task": "environments.task",
     "ScaledReward": "environments.wrappers",

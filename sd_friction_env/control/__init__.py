@@ -1,1 +1,1 @@
-"""Policies in NumPy: classical controllers, trained networks, the agents that come with the package."""
+"""Controllers in NumPy: classical feedback, trained networks, the agents of the package; videos of episodes."""

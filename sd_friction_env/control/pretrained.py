@@ -1,4 +1,4 @@
-"""Trained agents that come with the package, and the check that the environment still is the one they learned on."""
+"""Trained agents of the package, and the check that their environment has not changed since training."""
 
 import dataclasses
 import json
@@ -9,33 +9,33 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sd_friction_env.control.policies import NetworkPolicy, PolicyFileError, load_policy
+from sd_friction_env.control.policies.network import NetworkPolicy, PolicyFileError, load_policy
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.storage import AGENTS
 
 PRETRAINED = AGENTS / "best"
 
 _GOLDEN_STEPS = 60
-# Where another build rounds differently, an observation's last digit in single precision may flip (2e-7); a friction
-# coefficient changed by a thousandth moves 3e-4.
+# Rounding on other builds may change the last digit of an observation in single precision (2e-7); a friction
+# coefficient changed by 0.1% moves observations by 3e-4.
 _GOLDEN_TOLERANCE = 1e-6
 
 
 def bare_id(env_id: str) -> str:
-    """Return an environment's id without the module that Gymnasium lets one put before it."""
+    """Return an environment's id without the module name before the colon."""
     return env_id.rpartition(":")[2]
 
 
 def pretrained_file(env_id: str) -> Path:
-    """Return where the agent of an environment is kept, "SDFriction/Force-v0" in "SDFriction-Force-v0.npz"."""
+    """Return the path of an environment's agent: "SDFriction/Force-v0" is in "SDFriction-Force-v0.npz"."""
     return PRETRAINED / f"{bare_id(env_id).replace('/', '-')}.npz"
 
 
 def fingerprint(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return what a trained agent depends on, as JSON values.
+    """Return a record of an environment as JSON values, to compare the one trained on with the one at hand.
 
-    ``configuration``: spaces, task and nominal plant; ``golden``: observations and rewards under a fixed sequence of
-    actions that slips, sticks and breaks away, with a fixed seed.
+    ``configuration``: spaces, task and nominal plant; ``golden``: observations and rewards of an episode with a fixed
+    seed and fixed actions that slips, sticks and breaks away.
     """
     env = gym.make(env_id, **dict(env_kwargs or {})).unwrapped
     assert isinstance(env, SDFrictionEnv)
@@ -62,9 +62,9 @@ def _described(space: gym.Space[Any]) -> dict[str, Any]:
 
 
 def changes_since(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return what differs between two fingerprints, in words; nothing if the environment is the same.
+    """Return descriptions of the differences between two fingerprints; none if the environment is the same.
 
-    What a stored one lacks differs too: a foreign one does not pass for the same environment.
+    Parts that the stored one lacks are differences, too.
     """
     changed = []
     configuration = stored.get("configuration")
@@ -72,19 +72,19 @@ def changes_since(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
     for part, present in now["configuration"].items():
         values = parts.get(part)
         if not isinstance(values, Mapping) or not values:
-            changed.append(f"{part}: nothing is stored of it")
+            changed.append(f"{part}: not stored")
             continue
-        # An argument that is new since then has a default; whether that changes anything, the golden episode tells.
+        # New arguments are left out: the golden episode shows whether their defaults change anything.
         names = sorted(name for name in values if values[name] != present.get(name))
         changed += [f"{part} {name}: {values[name]!r} -> {present.get(name)!r}" for name in names]
-    changed += [f"{part}: it is unknown" for part in sorted(set(parts) - set(now["configuration"]))]
+    changed += [f"{part}: unknown" for part in sorted(set(parts) - set(now["configuration"]))]
     if not close(stored.get("golden", []), now["golden"], _GOLDEN_TOLERANCE):
         changed.append("the dynamics, the observation or the reward")
     return changed
 
 
 def close(stored: Any, now: Any, tolerance: float) -> bool:
-    """Return whether what is stored are numbers of the same shape as those of now, none farther off than that."""
+    """Return whether two arrays of numbers have the same shape and agree within a tolerance."""
     try:
         before, after = np.array(stored, dtype=float), np.array(now, dtype=float)
     except (TypeError, ValueError):  # ragged, or no numbers
@@ -93,15 +93,15 @@ def close(stored: Any, now: Any, tolerance: float) -> bool:
 
 
 def load_pretrained(env_id: str) -> NetworkPolicy:
-    """Return the agent that comes with the package for an environment; it needs NumPy alone.
+    """Return the package's trained agent for an environment; it needs only NumPy.
 
-    ``metadata`` of the policy says how it was trained and what it scored.
+    Its ``metadata`` record the training and the score.
 
     Args:
         env_id: one of ``ENVIRONMENT_IDS``, with its default arguments.
 
     Raises:
-        ValueError: if there is no agent for it.
+        ValueError: if the package has no agent for it.
         PolicyFileError: if the file is damaged, or was trained on another version of the environment.
     """
     known = sorted(path.stem.replace("SDFriction-", "SDFriction/", 1) for path in PRETRAINED.glob("*.npz"))

@@ -1,4 +1,4 @@
-"""Videos: passive and controlled oscillator side by side; needs pygame-ce and imageio (extra "video")."""
+"""Videos of episodes, passive and controlled side by side; needs pygame-ce and imageio (extra "video")."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sd_friction_env.control.policies import Policy, State, ZeroPolicy
+from sd_friction_env.control.policies.policy import Policy, State, ZeroPolicy
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.storage import checked_ending
 
@@ -33,15 +33,15 @@ def frames(
     """Yield the frames of an episode, the first before the first step.
 
     Args:
-        env_id: of the environment. policy: acts on its observations.
-        seed: of ``reset``. steps: how many at most; the episode may end before. size: of one picture, in pixels.
-        every: draw every so many control intervals.
-        side_by_side: the passive oscillator from the same start on the left, the controlled one on the right.
-        title: of the controlled one.
-        env_kwargs: of the environment.
+        env_id: of the environment. policy: its controller.
+        seed: of ``reset``. steps: at most; the episode may end before. size: of one picture, in pixels.
+        every: control intervals per frame.
+        side_by_side: whether to add the passive oscillator with the same start, on the left.
+        title: of the controlled oscillator's picture.
+        env_kwargs: arguments of the environment.
 
     Yields:
-        Arrays (height, width, 3), uint8; two pictures stand beside each other with a narrow gap.
+        Arrays (height, width, 3), uint8.
     """
     policies: dict[str, Policy] = {"passive": ZeroPolicy()} if side_by_side else {}
     policies[title] = policy
@@ -79,12 +79,12 @@ def _beside(pictures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
 
 
 def check_video_path(path: str | os.PathLike[str], fps: int = 30) -> Path:
-    """Return the path of a video to be written.
+    """Return the path of a video after checking that it can be written.
 
     Raises:
-        ValueError: if its ending is none of ``FORMATS``, its folder does not exist, or it cannot have so many frames a
-            second: at most 60, and 50 of a GIF (what players keep to).
-        ImportError: if what writes it is not installed.
+        ValueError: if its ending is none of ``FORMATS``, its folder does not exist, or ``fps`` exceeds what players
+            support: 60 frames a second, 50 for a GIF.
+        ImportError: if a package that writes it is not installed.
     """
     target, ending = Path(path), checked_ending(path, FORMATS, "the video's name")
     if target.is_dir() or not target.parent.is_dir():
@@ -109,11 +109,11 @@ def write_video(
     fps: int = 30,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Path:
-    """Write frames as .mp4 (H.264) or .gif, whole or not at all; return the path.
+    """Write frames to an .mp4 (H.264) or .gif file atomically; return the path.
 
     Args:
-        path: where to. pictures: of one size each. fps: frames a second.
-        progress: told how many frames are written.
+        path: of the file. pictures: frames of one size. fps: frames a second.
+        progress: called with the number of frames written.
 
     Raises:
         ValueError, ImportError: as :func:`check_video_path`. OSError: if it cannot be written.
@@ -121,16 +121,16 @@ def write_video(
     target = check_video_path(path, fps)
     import imageio.v2 as imageio
 
-    ending = target.suffix.lower()  # as imageio knows it
+    ending = target.suffix.lower()  # imageio knows lower case only
     unfinished = target.with_name(f".{target.stem}.{os.getpid()}{ending}")
-    # A GIF keeps its frames small by few colours; the pictures have few.
+    # Few colours keep a GIF small, and the pictures need no more.
     options: dict[str, Any] = (
         {"duration": 1000.0 / fps, "loop": 0, "subrectangles": True, "palettesize": 32}
         if ending == ".gif"
         else {"fps": fps, "macro_block_size": 2, "codec": "libx264", "quality": 7, "ffmpeg_log_level": "error"}
     )
     try:
-        unfinished.touch()  # told before imageio opens anything
+        unfinished.touch()  # a clear error before imageio opens anything
     except OSError as error:
         raise OSError(f"{os.fspath(path)!r}: {error.strerror}") from None
     try:

@@ -1,1 +1,1 @@
-"""The oscillator as Gymnasium environments: the task, one environment, the native batch, their adapters."""
+"""Gymnasium environments: the task, the single environment, the compiled batch and adapters to libraries."""

@@ -1,4 +1,4 @@
-"""Callbacks of Stable-Baselines3 that hyperparameter files can name."""
+"""Stable-Baselines3 callbacks for hyperparameter files."""
 
 from typing import Any
 
@@ -13,16 +13,16 @@ LOWEST_LOG_STD, HIGHEST_LOG_STD = -20.0, 5.0
 
 
 class AnnealedExploration(BaseCallback):
-    """Let PPO's exploration die out: the logarithm of its actions' standard deviation falls linearly in training.
+    """Anneal PPO's exploration: the logarithm of its actions' standard deviation falls linearly during training.
 
-    Left to itself PPO keeps a spread of a few tenths for very long. What a small standing action costs is then hidden
-    in the cost of the spread, and what is learned ends with a belt that runs a few percent slow.
+    Without annealing PPO keeps a standard deviation of a few tenths for very long. Exploration noise then hides the
+    cost of a small constant action, and the learned policy leaves the belt a few percent slow.
 
     Args:
-        start, end: logarithms of the standard deviation at the beginning and at the end, in [-20, 5].
+        start, end: logarithm of the standard deviation at the beginning and at the end, in [-20, 5].
 
     Raises:
-        TypeError, ValueError: if they are not.
+        TypeError, ValueError: if one is not such a number.
     """
 
     def __init__(self, start: float = 0.0, end: float = -2.5) -> None:
@@ -36,7 +36,7 @@ class AnnealedExploration(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         policy: Any = self.model.policy
-        # Not Stable-Baselines3's own progress: that of the last learn() stands there until the first rollout is over.
+        # Stable-Baselines3's own progress is that of the last learn() until the first rollout is over.
         left = 1.0 - self.model.num_timesteps / self.model._total_timesteps
         with torch.no_grad():
             policy.log_std.fill_(left * self.start + (1.0 - left) * self.end)

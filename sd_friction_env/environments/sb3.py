@@ -1,4 +1,4 @@
-"""The batch of environments as Stable-Baselines3 takes it. Importing this module imports Stable-Baselines3."""
+"""Batch of environments for Stable-Baselines3. Importing this module imports Stable-Baselines3."""
 
 import time
 from collections.abc import Collection, Iterable, Sequence
@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from sd_friction_env.environments.batch import RESET_KEYS, SDFrictionVectorEnv, checked_info_keys
-from sd_friction_env.environments.single import PLAIN_STATISTICS
+from sd_friction_env.environments.batch import SDFrictionVectorEnv
+from sd_friction_env.environments.info import PLAIN_STATISTICS, RESET_KEYS, checked_info_keys
 from sd_friction_env.extras import extra
 
 with extra("train"):
@@ -21,22 +21,22 @@ _ENTRY_POINT = f"{SDFrictionVectorEnv.__module__}:{SDFrictionVectorEnv.__name__}
 
 
 class SDFrictionVecEnv(VecEnv):
-    """A batch of friction oscillators for Stable-Baselines3: ``PPO("MlpPolicy", SDFrictionVecEnv(env_id, 256))``.
+    """Batch of friction oscillators for Stable-Baselines3: ``PPO("MlpPolicy", SDFrictionVecEnv(env_id, 256))``.
 
-    Environment i does bit for bit what ``gym.make(env_id)`` does in a ``DummyVecEnv`` with the same seed, and the
-    whole batch takes about as long as a few of those. An episode's last ``info`` holds ``terminal_observation``,
-    ``TimeLimit.truncated``, ``episode`` (return "r", length "l" and seconds since the start "t", as ``Monitor`` has
-    them, so no ``VecMonitor`` is needed) and ``statistics``, the first four of them also by themselves (see
-    :class:`SDFrictionEnv`). Methods take ``indices`` as ``DummyVecEnv`` does: None, whole numbers, negative ones from
+    Environment i matches ``gym.make(env_id)`` in a ``DummyVecEnv`` with the same seed bit for bit, and the whole batch
+    takes about the time of a few of those. An episode's last ``info`` has ``terminal_observation``,
+    ``TimeLimit.truncated``, ``episode`` (return "r", length "l" and seconds since the start "t", as in ``Monitor``, so
+    that no ``VecMonitor`` is needed), ``statistics`` and the first four of these as entries of their own (see
+    :class:`SDFrictionEnv`). Methods take ``indices`` as ``DummyVecEnv`` does: None or whole numbers, negative ones from
     the end.
 
     Args:
         env_id: such as "SDFriction/Force-v0".
-        num_envs: how many, in [1, 2**24].
-        info_keys: which names of the single environment's info every step's dictionaries hold: "all" or a sequence. By
-            default none, for a dictionary per environment costs more than the physics: ``batch_info`` has the reward's
-            terms as arrays.
-        stagger: whether :meth:`reset` cuts the first episodes short, each by another share, so that they do not all end
+        num_envs: number of environments, in [1, 2**24].
+        info_keys: "all", or the names of the single environment's info in every step's dictionaries. By default none,
+            because a dictionary per environment costs more than the physics; ``batch_info`` has the reward terms as
+            arrays.
+        stagger: whether :meth:`reset` shortens the first episodes, each by another share, so that they do not all end
             in the same step.
         **kwargs: other arguments of :class:`SDFrictionVectorEnv`: those of the environment, ``threads``,
             ``render_mode``, ``render_envs``.
@@ -46,7 +46,7 @@ class SDFrictionVecEnv(VecEnv):
         batch_info: its info of the last step, arrays.
 
     Raises:
-        TypeError, ValueError: if an argument is not as said, naming it and what is allowed.
+        TypeError, ValueError: if an argument has the wrong type or is out of range.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class SDFrictionVecEnv(VecEnv):
     ) -> None:
         for name in ("autoreset_mode", "copy"):
             if name in kwargs:
-                raise TypeError(f"{name} is not free here: Stable-Baselines3 needs its own")
+                raise TypeError(f"{name} cannot be chosen: Stable-Baselines3 needs its own")
         if not isinstance(stagger, bool):
             raise TypeError(f"stagger must be True or False, got {stagger!r}")
         keys = checked_info_keys(info_keys)
@@ -82,7 +82,7 @@ class SDFrictionVecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> NDArray[np.float32]:
-        """Start episodes with the seeds and options set before; return the observations (num_envs, size), float32."""
+        """Start episodes with the seeds and options set before; return observations (num_envs, size), float32."""
         options = self._options if any(self._options) else None
         observations, info = self.envs.reset(seed=self._seeds, options=options)
         self._reset_seeds()
@@ -93,7 +93,7 @@ class SDFrictionVecEnv(VecEnv):
         return observations
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take note of the actions (num_envs, 1)."""
+        """Store the actions (num_envs, 1)."""
         self._actions = actions
 
     def step_wait(
@@ -103,25 +103,21 @@ class SDFrictionVecEnv(VecEnv):
         observations, rewards, terminated, truncated, info = self.envs.step(self._actions)
         self.batch_info = info
         dones = terminated | truncated
+        cut = (truncated & ~terminated).tolist()
         infos: list[dict[str, Any]]
         if self._info_keys and not dones.all():
-            told = [name for name in self._info_keys if name in info]  # fewer if all have only been reset
-            infos = _rows(info, told, self.num_envs)
+            present = [name for name in self._info_keys if name in info]  # fewer if all have only been reset
+            infos = _rows(info, present, self.num_envs)
             for i, single in enumerate(infos):
-                single["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+                single["TimeLimit.truncated"] = cut[i]
         else:
             infos = [{} for _ in range(self.num_envs)]
         if "final_obs" in info:
-            self._finish(info, terminated, truncated, infos)
+            self._finish(info, cut, infos)
         return observations, rewards.astype(np.float32), dones, infos
 
-    def _finish(
-        self,
-        info: dict[str, Any],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
-        infos: list[dict[str, Any]],
-    ) -> None:
+    def _finish(self, info: dict[str, Any], cut: list[bool], infos: list[dict[str, Any]]) -> None:
+        """Write the infos of environments whose episodes have ended."""
         final = info["final_info"]
         seconds = round(time.monotonic() - self._began, 6)
         which = np.flatnonzero(info["_final_obs"]).tolist()
@@ -131,7 +127,7 @@ class SDFrictionVecEnv(VecEnv):
         for i, values, single in zip(which, _rows(statistics, names, self.num_envs, which), last, strict=True):
             self.reset_infos[i] = _single_infos(info, self.num_envs, [i])[0]
             infos[i] = single
-            single["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+            single["TimeLimit.truncated"] = cut[i]
             single["terminal_observation"] = info["final_obs"][i]
             single["statistics"] = values
             single.update((name, values[name]) for name in PLAIN_STATISTICS)
@@ -146,7 +142,7 @@ class SDFrictionVecEnv(VecEnv):
         return self.envs.attributes_at(indices, attr_name)
 
     def has_attr(self, attr_name: str) -> bool:
-        """Whether the environments, which are all of one kind, have an attribute of that name."""
+        """Return whether the environments have an attribute of that name."""
         try:
             self.envs.attributes_at([0], attr_name)
         except AttributeError:
@@ -166,18 +162,18 @@ class SDFrictionVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: int | Iterable[int] | None = None
     ) -> list[bool]:
-        """Whether environments are wrapped: in nothing, but they keep the statistics that ``Monitor`` keeps."""
+        """Return True for ``Monitor``, whose statistics the environments keep, and False for other wrappers."""
         return [issubclass(wrapper_class, Monitor)] * len(self.envs.places(indices))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Return a picture (height, width, 3) of each environment that is drawn."""
+        """Return a frame (height, width, 3) of each environment that is drawn."""
         return list(self.envs.render() or ())
 
 
 def _rows(
     columns: dict[str, Any], names: Sequence[str], num_envs: int, which: Sequence[int] | None = None
 ) -> list[dict[str, Any]]:
-    """Return a dictionary for each environment (or for ``which``) from arrays (num_envs,) by name."""
+    """Return one dictionary for each environment, or for ``which``, from arrays (num_envs,) by name."""
     if not names:
         return [{} for _ in (range(num_envs) if which is None else which)]
     listed = [(columns[name] if which is None else columns[name][which]).tolist() for name in names]
@@ -185,7 +181,7 @@ def _rows(
 
 
 def _single_infos(info: dict[str, Any], num_envs: int, which: Sequence[int] | None = None) -> list[dict[str, Any]]:
-    """Return what info says of each environment that has just been reset."""
+    """Return the info of each environment that has just been reset."""
     infos = _rows(info, [name for name in RESET_KEYS if name in info], num_envs, which)
     parameters = info["parameters"]
     inner = [name for name in parameters if not name.startswith("_")]

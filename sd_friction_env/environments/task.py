@@ -1,4 +1,4 @@
-"""What is asked of a controller: actuator, start, sensing, randomisation and the weights of the reward."""
+"""The control task: actuator, start, sensing, randomisation and reward weights."""
 
 import dataclasses
 import functools
@@ -17,6 +17,7 @@ from sd_friction_env.physics.parameters import (
     RANGES,
     SMALLEST_ALPHA,
     STATE_LIMIT,
+    Kind,
     OscillatorParameters,
     checked_choice,
     checked_count,
@@ -30,15 +31,16 @@ Sensor = Literal["state", "position"]
 FloatArray: TypeAlias = NDArray[np.float64]
 IntegerArray: TypeAlias = NDArray[np.int64]
 
-RANDOMISABLE = (  # each has its own random numbers, by its place here
+ACTUATOR_CODES = {"force": kernel.FORCE, "belt_speed": kernel.BELT_SPEED}
+RANDOMISABLE = (  # the position in this list selects a parameter's random numbers
     *("alpha", "g1", "beta", "mu_s", "mu_m", "v_m", "belt_speed", "mu_k", "delta", "v_0", "mu_v", "kappa"),
     *(f"{kind}_{what}" for kind in EXCITATIONS for what in ("amplitude", "frequency", "phase")),
     "linear_stiffness",
 )
 
-# Slots of the counter-based generator at step 0 of an episode; sensor noise uses the steps from 1 on.
-PHASE_SLOT, _X_SLOT, _V_SLOT, _PARAMETER_SLOT = 0, 1, 2, 8  # of the random numbers with which an episode begins
-_LAW_SLOT = 1024  # the first of those of laws of one's own
+# Slots of the counter-based generator at step 0 of an episode; sensor noise uses steps from 1 on.
+PHASE_SLOT, _X_SLOT, _V_SLOT, _PARAMETER_SLOT = 0, 1, 2, 8
+_LAW_SLOT = 1024  # first slot of the parameters of user-defined laws
 
 _RANGES: dict[str, tuple[float, float]] = {
     "force_limit": (0.0, 100.0),
@@ -59,38 +61,38 @@ _SCALES: dict[str, tuple[float, float]] = {"x_offset": (-1e12, 1e12), "x_scale":
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A control task on an oscillator (dimensionless).
+    """Control task on an oscillator (dimensionless).
 
     Attributes:
-        actuator: "force" (u = force_limit * action) or "belt_speed" (the belt heads for
+        actuator: "force" (u = force_limit * action) or "belt_speed" (the target of the belt speed is
             (1 + belt_authority * action) * belt_speed).
-        force_limit: greatest control force, in [0, 100].
-        belt_authority: greatest relative change of the belt speed asked for, in [0, 1].
-        belt_acceleration_limit: greatest acceleration of the belt, in [0, 1e6].
-        control_interval: time an action is held, in [1e-4, 10].
-        episode_steps: control intervals after which an episode is truncated.
-        w_effort, w_stick: weights of the squared action and of the share of time stuck, in [0, 1e6].
-        start: "cycle" (a random phase of the passive limit cycle; where there is none, the equilibrium with ``kick``),
-            "rest" (at the unloaded spring's place of rest, v = 0) or "random" (x within 3 x_scale of x_offset, v
-            within 4 v_scale of 0).
-        kick: velocity given to a mass that starts at its equilibrium.
-        randomise: parameters drawn evenly from (low, high) at each reset, by name; numbers of a law of your own as
-            ``friction.NAME`` or ``geometry.NAME``.
+        force_limit: largest control force, in [0, 100].
+        belt_authority: largest relative change of the belt speed, in [0, 1].
+        belt_acceleration_limit: largest acceleration of the belt, in [0, 1e6].
+        control_interval: time for which an action is held, in [1e-4, 10].
+        episode_steps: control intervals after which an episode is truncated, in [1, 1e9].
+        w_effort, w_stick: weights of the squared action and of the stick fraction, in [0, 1e6].
+        start: "cycle" (random phase of the passive limit cycle, or, without a cycle, the equilibrium with ``kick``),
+            "rest" (equilibrium of the unloaded spring, v = 0) or "random" (x within 3 x_scale of x_offset, v within
+            4 v_scale of 0).
+        kick: initial velocity of a mass that starts at its equilibrium, in [-10, 10].
+        randomise: ranges (low, high) of parameters drawn uniformly at each reset, by name; parameters of a user-defined
+            law as ``friction.NAME`` or ``geometry.NAME``.
         show_parameters: whether the observation ends with the randomised parameters, each scaled to [-1, 1].
-        show_phases: whether the observation holds the cosine and sine of the phase of each excitation (force, ripple,
-            stiffness); without it they are hidden.
-        sensor: "state" (x, v and, with the belt actuator, the belt's modulation) or "position" (x alone).
+        show_phases: whether the observation has the cosine and sine of the phase of each excitation (force, ripple,
+            stiffness).
+        sensor: "state" (x, v and, with the belt actuator, the belt modulation) or "position" (x only).
         sensor_noise: standard deviation of the noise on x (and v), in [0, 10].
-        sensor_delay: age of what is seen, in control intervals, 0 to 1000.
-        contact_loss_cost: least cost of each step left when contact is lost; the worst cost per step that the episode
-            has seen counts if it is greater.
-        observation_limit: observations are clipped to plus or minus this.
-        x_offset, x_scale, v_scale: observations are (x - x_offset)/x_scale and v/v_scale. None: from the nominal
-            plant's passive motion (equilibrium, half the amplitude, half the belt speed), never from an episode's own
-            parameters, which would give them away.
+        sensor_delay: delay of the sensor in control intervals, in [0, 1000].
+        contact_loss_cost: smallest cost of each remaining step when contact is lost, in [0, 1e6]; the largest cost per
+            step of the episode replaces it if that is larger.
+        observation_limit: observations are clipped to [-observation_limit, observation_limit], in [1e-3, 1e6].
+        x_offset, x_scale, v_scale: observations are (x - x_offset)/x_scale and v/v_scale. None: equilibrium, half the
+            amplitude and half the belt speed of the nominal plant's passive motion. An episode's own parameters never
+            enter, because the scales would reveal them.
 
     Raises:
-        TypeError, ValueError: if a value is not as said, naming it and what is allowed.
+        TypeError, ValueError: if an argument has the wrong type or is out of range.
     """
 
     actuator: Actuator = "force"
@@ -134,7 +136,7 @@ class Task:
 
     @classmethod
     def field_names(cls) -> tuple[str, ...]:
-        """Return the names of all arguments."""
+        """Return the names of all fields."""
         return tuple(field.name for field in dataclasses.fields(cls))
 
     @classmethod
@@ -146,24 +148,66 @@ class Task:
         """
         unknown = sorted(set(arguments) - set(cls.field_names()))
         if unknown:
-            # Python's own words: by these, clients that try an argument know that there is no such argument.
+            # Gymnasium looks for Python's own wording when it tries optional arguments.
             allowed = ", ".join(cls.field_names())
             raise TypeError(f"__init__() got an unexpected keyword argument {unknown[0]!r}; allowed: {allowed}")
         return cls(**arguments)
 
     @property
     def authority(self) -> float:
-        """What an action of 1 means to the actuator: ``force_limit`` or ``belt_authority``."""
+        """Actuator command at an action of 1: ``force_limit`` or ``belt_authority``."""
         return self.force_limit if self.actuator == "force" else self.belt_authority
 
     @property
-    def late_steps(self) -> int:
-        """Steps before the last quarter of an episode."""
-        return steps_before_last_quarter(self.episode_steps)
+    def sees_belt(self) -> bool:
+        """Whether the observation has the belt modulation."""
+        return self.sensor == "state" and self.actuator == "belt_speed"
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Names of the parameters that the observation shows."""
+        return tuple(self.randomise) if self.show_parameters else ()
+
+    @property
+    def observation_size(self) -> int:
+        """Number of entries of an observation."""
+        phases = 2 * len(EXCITATIONS) if self.show_phases else 0
+        return 1 + (self.sensor == "state") + self.sees_belt + phases + len(self.shown)
+
+    def kind_of(self, parameters: OscillatorParameters) -> Kind:
+        """Return the kind of an episode's plant; it is excited if phases are shown, even at amplitude 0."""
+        kind = parameters.kind
+        return kind._replace(excited=kind.excited or self.show_phases)
+
+    def arrays(self) -> tuple[FloatArray, IntegerArray]:
+        """Return the task as the kernel takes it: its floats and its codes (:mod:`sd_friction_env.kernel.rows`)."""
+        numbers = np.zeros(kernel.TASK_NUMBERS)
+        numbers[kernel.TASK_AUTHORITY] = self.authority
+        numbers[kernel.TASK_A_LIMIT] = self.belt_acceleration_limit
+        numbers[kernel.TASK_INTERVAL] = self.control_interval
+        numbers[kernel.TASK_W_EFFORT] = self.w_effort
+        numbers[kernel.TASK_W_STICK] = self.w_stick
+        numbers[kernel.TASK_CONTACT_LOSS_COST] = self.contact_loss_cost
+        numbers[kernel.TASK_LIMIT] = self.observation_limit
+        numbers[kernel.TASK_X_OFFSET] = self.x_offset
+        numbers[kernel.TASK_X_SCALE] = self.x_scale
+        numbers[kernel.TASK_V_SCALE] = self.v_scale
+        numbers[kernel.TASK_BELT_AUTHORITY] = self.belt_authority or 1.0
+        numbers[kernel.TASK_SENSOR_NOISE] = self.sensor_noise
+        codes = np.zeros(kernel.TASK_CODES, np.int64)
+        codes[kernel.TASK_ACTUATOR] = ACTUATOR_CODES[self.actuator]
+        codes[kernel.TASK_EPISODE_STEPS] = self.episode_steps
+        codes[kernel.TASK_LATE_STEPS] = steps_before_last_quarter(self.episode_steps)
+        codes[kernel.TASK_FULL_STATE] = self.sensor == "state"
+        codes[kernel.TASK_SEES_BELT] = self.sees_belt
+        codes[kernel.TASK_SENSOR_DELAY] = self.sensor_delay
+        codes[kernel.TASK_SEES_PHASES] = self.show_phases
+        codes[kernel.TASK_TRAVEL] = True
+        codes[kernel.TASK_SHOWS] = len(self.shown)
+        return numbers, codes
 
     def with_scales(self, nominal: OscillatorParameters) -> Self:
-        """Return the task with the observation scales that were left open taken from the nominal plant's unexcited
-        motion."""
+        """Return the task with each observation scale that is None set from the nominal plant's unexcited motion."""
         if None not in (self.x_offset, self.x_scale, self.v_scale):
             return self
         nominal = nominal.unexcited
@@ -184,7 +228,7 @@ class Task:
         """Return the values drawn for the randomised parameters of n episodes, by name, each (n,).
 
         Args:
-            keys, episodes: (n,), whole numbers; each episode's values depend on its own two alone.
+            keys, episodes: (n,), whole numbers; the values of an episode depend on its own key and number only.
         """
         values = {}
         for name, (low, high) in self.randomise.items():
@@ -214,10 +258,10 @@ class Task:
         return nominal.replace(**{name: float(values[0]) for name, values in drawn.items()})
 
     def shown_parameters(self, values: Mapping[str, Any]) -> FloatArray:
-        """Return what an observation shows of n episodes' parameters, (p, n), or (p,) if ``values`` are no arrays.
+        """Return the randomised parameters as observations show them, (p, n) or (p,).
 
         Args:
-            values: of each parameter, by name, each (n,) or a number.
+            values: of all parameters, by name, arrays (n,) or numbers.
         """
         rows = []
         for name, (low, high) in self.randomise.items():
@@ -237,8 +281,7 @@ class Task:
         return self.cycle_state(parameters, float(self.phases(keys, episodes)[0]))
 
     def cycle_state(self, parameters: OscillatorParameters, phase: float) -> tuple[float, float]:
-        """Return the passive, unexcited cycle's state at a phase in [0, 1], or the kicked equilibrium where nothing
-        oscillates."""
+        """Return the state at a phase in [0, 1] of the passive cycle, or, without a cycle, the kicked equilibrium."""
         parameters = parameters.unexcited
         cycle = passive_motion(parameters)
         if cycle is None:
@@ -250,14 +293,14 @@ class Task:
 
 
 def _slot_of(name: str) -> int:
-    """Return the slot of the random numbers that draw a parameter."""
+    """Return a parameter's slot of the random numbers."""
     if name in RANDOMISABLE:
         return _PARAMETER_SLOT + RANDOMISABLE.index(name)
     return _LAW_SLOT + zlib.crc32(name.encode())
 
 
 def steps_before_last_quarter(episode_steps: int) -> int:
-    """Return how many of an episode's steps come before its last quarter."""
+    """Return the number of an episode's steps before its last quarter."""
     return episode_steps - max(1, episode_steps // 4)
 
 
@@ -266,9 +309,9 @@ def _checked_randomisation(randomise: Any) -> dict[str, tuple[float, float]]:
         raise TypeError(f"randomise must map parameter names to (low, high), got {randomise!r}")
     checked = {}
     for name, interval in randomise.items():
-        of_own_law = isinstance(name, str) and name.startswith(("friction.", "geometry."))
-        if name not in RANDOMISABLE and not of_own_law:
-            allowed = f"{', '.join(RANDOMISABLE)}, and friction.NAME or geometry.NAME of a law of your own"
+        user_defined = isinstance(name, str) and name.startswith(("friction.", "geometry."))
+        if name not in RANDOMISABLE and not user_defined:
+            allowed = f"{', '.join(RANDOMISABLE)}, and friction.NAME or geometry.NAME of a user-defined law"
             raise ValueError(f"randomise has no parameter {name!r}; allowed: {allowed}")
         try:
             low, high = interval
@@ -289,8 +332,7 @@ def _checked_randomisation(randomise: Any) -> dict[str, tuple[float, float]]:
 
 @functools.lru_cache(maxsize=4096)
 def passive_motion(parameters: OscillatorParameters) -> LimitCycle | None:
-    """Return the attractor of a mass set down at x = 0 with the belt, without excitation; None if it loses contact or
-    does not settle."""
+    """Return the attractor of the unexcited motion from x = 0, v = v_belt; None if contact is lost or none is found."""
     try:
         return limit_cycle(parameters.unexcited)
     except OrbitError:
@@ -304,11 +346,11 @@ def rig_arguments(
     force_limit: float | None = None,
     belt_acceleration_limit: float | None = None,
 ) -> dict[str, Any]:
-    """Return task arguments for a rig whose controller works in SI units.
+    """Convert task arguments from SI units to dimensionless ones.
 
     Args:
-        parameters: of the rig, made by :meth:`OscillatorParameters.from_physical`.
-        sampling_time: of the controller, s. force_limit: greatest control force, N.
+        parameters: of the rig, from :meth:`OscillatorParameters.from_physical`.
+        sampling_time: of the controller, s. force_limit: largest control force, N.
         belt_acceleration_limit: of the belt, m/s^2.
 
     Returns:

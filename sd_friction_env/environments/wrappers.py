@@ -1,4 +1,4 @@
-"""Gymnasium wrappers that hyperparameter files can name."""
+"""Gymnasium wrappers for hyperparameter files."""
 
 from typing import Any, SupportsFloat
 
@@ -21,9 +21,9 @@ class ScaledReward(gym.RewardWrapper[Any, Any]):
 
     Args:
         env: the environment.
-        scale: the factor, in [1e-6, 1e6]: algorithms want returns of the order of one.
-        power: in [0.1, 1]. Less than 1 lets the small costs of a machine that almost stands still count for more beside
-            the thousandfold costs of a squealing one: residual motion and standing actions then die out.
+        scale: factor, in [1e-6, 1e6]. Algorithms work best with returns of order one.
+        power: exponent, in [0.1, 1]. Less than 1 gives the small costs near standstill more weight against the
+            thousandfold costs of squealing, so that residual motion and constant actions die out.
 
     Raises:
         TypeError, ValueError: if ``scale`` or ``power`` is not such a number.

@@ -35,8 +35,8 @@ import sd_friction_env
 from sd_friction_env import kernel
 from sd_friction_env.control.policies import PolicyFileError, Readings, State
 from sd_friction_env.control.pretrained import close
-from sd_friction_env.environments.single import ACTUATOR_CODES, SDFrictionEnv
-from sd_friction_env.environments.task import Task, passive_motion
+from sd_friction_env.environments.single import SDFrictionEnv
+from sd_friction_env.environments.task import ACTUATOR_CODES, Task, passive_motion
 from sd_friction_env.physics.parameters import OscillatorParameters
 from sd_friction_env.storage import (
     AGENTS,

@@ -701,7 +701,7 @@ def _environment_arrays(envs: VecEnv) -> dict[str, NDArray[Any]]:
     """Return the very arrays that hold the state of :func:`make_training_envs`, statistics and random keys included."""
     base = envs.unwrapped
     assert isinstance(base, SDFrictionVecEnv)
-    arrays = {name: value for name, value in base.envs.__getstate__().items() if isinstance(value, np.ndarray)}
+    arrays = base.envs.arrays()
     stack = unwrap_vec_wrapper(envs, VecFrameStack)
     if isinstance(stack, VecFrameStack):
         arrays["stacked observations"] = stack.stacked_obs.stacked_obs

@@ -292,7 +292,7 @@ def test_pictures_are_tiled():
     ("arguments", "message"),
     [
         ({"env_id": "CartPole-v1"}, "env_id must name"),
-        ({"copy": False}, "copy is not free"),
+        ({"copy": False}, "copy cannot be chosen"),
         ({"stagger": 1}, "stagger must be"),
         ({"num_envs": 0}, r"num_envs must be .* in \[1, "),
         ({"info_keys": ["nonsense"]}, "info_keys must be one of"),

@@ -27,7 +27,7 @@ from sd_friction_env import (
     simulate,
     stick_intervals,
 )
-from sd_friction_env.environments.single import numbers_of
+from sd_friction_env.environments.info import numbers_of
 from sd_friction_env.physics import theory
 from sd_friction_env.physics.basins import basins
 from sd_friction_env.physics.orbits import first_lyapunov_coefficient, grazing_belt_speed, hopf_belt_speed, slip_cycles

@@ -140,7 +140,7 @@ def test_a_picture_shows_a_middling_run_and_not_the_best(tmp_path):
 
 def test_the_best_classical_controller_is_shown_and_what_is_missing_is_said(monkeypatch):
     feedback = VelocityFeedback.from_env(evaluation.make_env(ENV_IDS["force", "nominal"]), 1.5)
-    tuned = {"weak": VelocityFeedback(0.01, feedback.readings), "good": feedback}
+    tuned = {"weak": VelocityFeedback(0.01, readings=feedback.readings), "good": feedback}
     known = evaluation.optimal_returns(ENV_IDS["force", "nominal"], evaluation.EVALUATION_SEEDS[:3])
     known[1] = np.nan
     monkeypatch.setattr(classical, "classical_controllers", lambda env_id: tuned)

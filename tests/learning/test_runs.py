@@ -430,7 +430,7 @@ def other_plan(partial):
 
 def other_shapes(partial):
     saved = runs.load_tensors(runs.checkpoints(partial)[0])
-    saved["environments"]["_state"] = saved["environments"]["_state"][:, :2]
+    saved["environments"]["state"] = saved["environments"]["state"][:, :2]
     resealed(runs.checkpoints(partial)[0], saved)
 
 

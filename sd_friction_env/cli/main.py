@@ -32,7 +32,7 @@ from sd_friction_env.physics.rigs import read_rig
 from sd_friction_env.physics.simulation import simulate
 from sd_friction_env.physics.tables import Table
 from sd_friction_env.pictures import plotting
-from sd_friction_env.pictures.rendering import checked_size
+from sd_friction_env.pictures.renderer import checked_size
 from sd_friction_env.storage import HYPERPARAMETERS, atomic_file, checked_ending
 
 FAILURE, BAD_USAGE, INTERRUPTED = 1, 2, 130

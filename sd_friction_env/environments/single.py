@@ -30,7 +30,7 @@ from sd_friction_env.physics.parameters import (
     checked_number,
 )
 from sd_friction_env.physics.simulation import amplitude
-from sd_friction_env.pictures.rendering import checked_size
+from sd_friction_env.pictures.renderer import checked_size
 
 RewardFunction = Callable[[Mapping[str, Any]], float]
 
@@ -512,7 +512,8 @@ class SDFrictionEnv(KnowsItsLength, gym.Env[NDArray[np.float32], NDArray[np.floa
         if self.render_mode is None:
             gym.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array' or 'human'")
             return None
-        from sd_friction_env.pictures.rendering import Renderer, Scene
+        from sd_friction_env.pictures.renderer import Renderer
+        from sd_friction_env.pictures.scene import Scene
 
         if self._renderer is None:
             self._renderer = Renderer(self.render_mode, *self.render_size, fps=self.metadata["render_fps"])

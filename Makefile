@@ -15,7 +15,10 @@ else
 RUN := $(VENV)/bin/python
 PEERS_RUN := .venv-peers/bin/python
 endif
+DEMO_STAMP := $(VENV)/.demo
 STAMP := $(VENV)/.installed
+# pip's output; make setup QUIET= shows it.
+QUIET ?= --quiet
 # Goes in first and alone: TORCH_INDEX holds PyTorch, not our versions of what it needs.
 TORCH := $(shell sed -n '/^torch==/p' constraints.txt)
 TORCH_FROM := $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX))
@@ -30,9 +33,9 @@ help: ## list the targets
 	@echo
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  \1\t\2/p' Makefile | expand -t 20
 
-setup: $(STAMP) ## make .venv and install the project into it, with pinned versions
+setup: $(STAMP) ## make .venv and install the project with all that its checks and extras need
 
-$(STAMP): pyproject.toml constraints.txt
+$(VENV)/.made:
 	@command -v "$(PYTHON)" >/dev/null 2>&1 || { \
 	  echo "make: '$(PYTHON)' was not found. Install Python 3.11 or newer, or name yours: make setup PYTHON=python3.12" >&2; \
 	  exit 1; }
@@ -49,13 +52,21 @@ $(STAMP): pyproject.toml constraints.txt
 	@"$(RUN)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "make: $(VENV) holds a Python older than 3.11. Remove it (make clean VENV=$(VENV)) and try again." >&2; \
 	  exit 1; }
-	@echo "Installing pinned versions into $(VENV): the first time a few minutes and 1 GB or more, most of it PyTorch ..."
-	"$(RUN)" $(PIP) install -c constraints.txt --no-deps $(TORCH_FROM) $(TORCH)
-	"$(RUN)" $(PIP) install -c constraints.txt -e ".[all,dev]"
+	@touch "$@"
+
+$(DEMO_STAMP): $(VENV)/.made pyproject.toml constraints.txt
+	@echo "Installing what the demo needs into $(VENV): a few minutes the first time, most of the download is PyTorch ..."
+	@"$(RUN)" $(PIP) install $(QUIET) -c constraints.txt --no-deps $(TORCH_FROM) $(TORCH)
+	@"$(RUN)" $(PIP) install $(QUIET) -c constraints.txt -e ".[plot,train]"
+	@touch "$@"
+
+$(STAMP): $(DEMO_STAMP)
+	@echo "Installing the rest: all extras, and what the checks need ..."
+	@"$(RUN)" $(PIP) install $(QUIET) -c constraints.txt -e ".[all,dev]"
 	@touch "$@"
 	@echo "Ready. 'make demo' shows what it does, 'make test' checks it."
 
-demo: setup ## draw the amplitude curve, train both agents, compare them with passive and classical (minutes)
+demo: $(DEMO_STAMP) ## draw the amplitude curve, train both agents, compare them with passive and classical (minutes)
 	"$(RUN)" scripts/demo.py $(ARGS)
 
 test: setup ## run every check and test
@@ -89,7 +100,7 @@ figures: setup ## compute and draw the paper's figures again
 	for name in 2 3 4 5 basins linear chaos control; do "$(RUN)" scripts/figure_$$name.py || exit 1; done
 
 report: setup ## evaluate every controller on every task; write report_output/report.html (a minute)
-	"$(RUN)" scripts/report.py $(ARGS)
+	"$(RUN)" -m sd_friction_env report $(ARGS)
 
 docs: export NO_MKDOCS_2_WARNING := 1
 docs: setup ## build the documentation into site/ (open site/index.html)

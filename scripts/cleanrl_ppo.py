@@ -8,7 +8,7 @@
 Proximal policy optimisation (Schulman et al. 2017, arXiv:1707.06347) with generalised advantages (Schulman et al. 2016,
 arXiv:1506.02438). Two things differ from CleanRL's ppo_continuous_action.py: an episode that was only cut short by its
 time limit is continued by the value of its last observation, and the spread of the actions falls on a schedule. For
-runs that are kept, resumed and evaluated there is scripts/train.py.
+runs that are kept, resumed and evaluated there is `sd-friction train`.
 """
 
 import argparse
@@ -23,8 +23,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from scripts.train import Parser
 from sd_friction_env import ENVIRONMENT_IDS
+from sd_friction_env.cli.options import Parser
 from sd_friction_env.control.policies import NetworkPolicy
 from sd_friction_env.environments.wrappers import scaled_reward
 

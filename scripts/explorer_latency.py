@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from scripts.train import Parser
+from sd_friction_env.cli.options import Parser
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 

@@ -3,7 +3,7 @@
     python scripts/figure_control.py                     writes control.csv (the paths) and .png into figures/
     python scripts/figure_control.py --out elsewhere     into another folder
 
-Both come from the stored value functions (scripts/optimum.py --policy). On belt they are those at the nominal belt
+Both come from the stored value functions (sd-friction optimum --policy). On belt they are those at the nominal belt
 speed; along the controlled path it varies. There an action of .5 already asks for all of the belt's acceleration.
 """
 

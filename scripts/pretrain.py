@@ -4,7 +4,7 @@
     python scripts/pretrain.py --only belt-nominal --algo td3    some of them
     python scripts/pretrain.py --package-only                    choose and package again, without training
 
-Every run is one of scripts/train.py, in agents/pretrained/TASK-TIER-ALGO-SEED without its checkpoints. Runs that are
+Every run is one of `sd-friction train`, in agents/pretrained/TASK-TIER-ALGO-SEED without its checkpoints. Runs that are
 there are kept, unfinished ones resumed: stop with Ctrl-C, start again with the same command. For each task and tier
 the run with the best validation episodes goes to agents/best/, with what it did on the evaluation
 episodes.
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from scripts.train import TASKS, TIERS, Parser, environment_id
+from sd_friction_env.cli.options import TASKS, TIERS, Parser, environment_id
 from sd_friction_env.control.pretrained import fingerprint, pretrained_file
 from sd_friction_env.learning import evaluation, runs
 
@@ -49,7 +49,11 @@ def train(name: str, algorithm: str, seed: int) -> str:
     if runs.partial_folder(folder).is_dir():
         command += ["--resume"]
     run = subprocess.run(
-        [sys.executable, "scripts/train.py", *command], cwd=ROOT, check=False, capture_output=True, text=True
+        [sys.executable, "-m", "sd_friction_env", "train", *command],
+        cwd=ROOT,
+        check=False,
+        capture_output=True,
+        text=True,
     )
     if run.returncode:
         return f"{folder.name}: {run.stderr.strip().splitlines()[-1] if run.stderr.strip() else run.returncode}"

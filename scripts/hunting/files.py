@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from scripts.train import Parser, assignments
 from sd_friction_env import Table
+from sd_friction_env.cli.options import Parser, assignments
 from sd_friction_env.control.policies import NetworkPolicy, load_policy
 from sd_friction_env.learning import classical, optimal, runs, training
 from sd_friction_env.physics.sweeps import Engine, run_chunks

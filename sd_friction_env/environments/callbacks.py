@@ -2,10 +2,12 @@
 
 from typing import Any
 
-import torch
-from stable_baselines3.common.callbacks import BaseCallback
-
+from sd_friction_env.extras import extra
 from sd_friction_env.physics.parameters import checked_number
+
+with extra("train"):
+    import torch
+    from stable_baselines3.common.callbacks import BaseCallback
 
 LOWEST_LOG_STD, HIGHEST_LOG_STD = -20.0, 5.0
 

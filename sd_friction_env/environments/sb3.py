@@ -8,11 +8,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from sd_friction_env.environments.batch import RESET_KEYS, SDFrictionVectorEnv, checked_info_keys
 from sd_friction_env.environments.single import PLAIN_STATISTICS
+from sd_friction_env.extras import extra
+
+with extra("train"):
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 _ENTRY_POINT = f"{SDFrictionVectorEnv.__module__}:{SDFrictionVectorEnv.__name__}"
 

@@ -12,7 +12,8 @@ import pytest
 
 from sd_friction_env import Table, __version__, limit_cycle
 from sd_friction_env.cli import doctor
-from sd_friction_env.cli.main import main, numbers
+from sd_friction_env.cli.main import main
+from sd_friction_env.cli.options import numbers
 from sd_friction_env.control import pretrained
 from sd_friction_env.control.pretrained import pretrained_file
 from sd_friction_env.physics.forced import bifurcation_diagram, lyapunov_exponent, poincare_section
@@ -203,7 +204,7 @@ def test_a_video_shows_the_passive_and_the_controlled_oscillator(tmp_path, capsy
     assert (count, seconds) == (4, pytest.approx(4 / 30, abs=0.01))
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["pair.gif", "pair.mp4"]
     alone = tmp_path / "alone.gif"
-    assert main(["video", "--task", "force", "--agent", "none", "--alone", "--out", str(alone), *small]) == 0
+    assert main(["video", "--task", "force", "--agent", "passive", "--alone", "--out", str(alone), *small]) == 0
     assert imageio.imread(alone, index=None).shape == (4, 240, 320, 3)
     assert capsys.readouterr().err == ""
 
@@ -229,7 +230,7 @@ def test_a_video_shows_any_agent_that_fits(tmp_path, capsys):
         ("--task force --out film.gif --size 10 10", "render_size width must be"),
         ("--task force --out film.mp4 --size 321 240", "--size must be even for .mp4, got 321 240"),
         ("--task force --out film.gif --seed -1", "--seed must be at least 0, got -1"),
-        ("--task force --out film.gif --agent someone", "or a policy.npz, got 'someone'"),
+        ("--task force --out film.gif --agent someone", "or a policy's .npz, got 'someone'"),
         ("--task force --out film.gif --agent none.npz", "none.npz"),
         ("--task force --out film.gif --gain 2", "--gain goes with --agent velocity-feedback"),
         ("--task force --tier sensed --agent velocity-feedback --out film.gif", "sees the position only"),

@@ -15,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from scripts import tune_classical
 from sd_friction_env import ENVIRONMENT_IDS, equilibria, storage
+from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import ConstantPolicy, LinearFeedback, VelocityFeedback
 from sd_friction_env.learning import classical, evaluation
 from sd_friction_env.physics import theory
@@ -137,7 +137,7 @@ def test_stored_gains_do_what_is_stored_with_them(env_id):
         came_to, said = table["return"].mean(), stored[name]["validation_return"]
         assert came_to == pytest.approx(said, rel=1e-9 if rests else 0.02), name
         assert table["suppressed"].mean() == pytest.approx(stored[name]["suppressed"], abs=0.0 if rests else 0.03), name
-        assert stored[name]["command"].startswith("python scripts/tune_classical.py")
+        assert stored[name]["command"].startswith(("python scripts/tune_classical.py", "sd-friction tune-classical"))
         assert set(stored[name]["versions"]) == set(classical.versions())
 
 
@@ -231,7 +231,7 @@ def test_the_script_keeps_what_is_finished(tmp_path, monkeypatch, capsys):
         return GAIN | {"at_bound": {"gain": ""}}
 
     command = ["--task", "force", "--tier", "nominal", "--controller", "velocity feedback", "LQR"]
-    assert tune_classical.main(command) == 130
+    assert main(["tune-classical", *command]) == 130
     told = capsys.readouterr()
     assert "interrupted; what was finished is kept" in told.err
     assert "gain is at its bound: a wider one may find better" in told.out
@@ -266,8 +266,8 @@ def test_each_entry_keeps_its_own_versions_and_a_worse_one_is_not_kept(tmp_path,
     assert classical.keep(FORCE, "velocity feedback", best, file) == best
     monkeypatch.setattr(classical, "GAINS_FILE", file)
     monkeypatch.setattr(classical, "tune", lambda name, env_id, **how: worse)
-    assert tune_classical.main(["--task", "force", "--tier", "nominal", "--controller", "velocity feedback"]) == 0
-    assert "not kept: what is stored comes to -62.67" in capsys.readouterr().out
+    assert main(["tune-classical", "--task", "force", "--tier", "nominal", "--controller", "velocity feedback"]) == 0
+    assert "not kept: the stored gains reach -62.67" in capsys.readouterr().out
 
 
 def test_what_several_keep_at_once_is_all_kept(tmp_path, monkeypatch):
@@ -334,9 +334,7 @@ def test_where_there_is_no_fcntl_the_lock_is_that_of_windows(tmp_path, monkeypat
     ],
 )
 def test_the_script_refuses_what_cannot_be(arguments, message, capsys):
-    with pytest.raises(SystemExit) as stop:
-        tune_classical.main(arguments)
-    assert stop.value.code == 2
+    assert main(["tune-classical", *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from scripts import evaluate_grid
 from sd_friction_env import Table, load_pretrained
+from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import ZeroPolicy
 from sd_friction_env.learning import evaluation, grids
 from sd_friction_env.physics.sweeps import Engine
@@ -43,7 +43,7 @@ def test_the_program_writes_the_grid_and_keeps_its_chunks(tmp_path, table):
     over = ["--over", "alpha", "0.7:0.8:0.1", "--over", "belt-speed", "0.15:0.25:0.05"]
     out, folder = tmp_path / "grid.csv", tmp_path / "kept"
     command = ["--task", "force", *over, "--episodes", "2", "--out", str(out), "--folder", str(folder)]
-    assert evaluate_grid.main(command) == 0
+    assert main(["grid", *command]) == 0
     written = Table.from_csv(out)
     assert written["belt_speed"] == pytest.approx(table["belt_speed"])
     assert (folder / "sweep.json").exists()
@@ -62,9 +62,7 @@ def test_the_program_writes_the_grid_and_keeps_its_chunks(tmp_path, table):
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(arguments, named, capsys):
-    with pytest.raises(SystemExit) as stop:
-        evaluate_grid.main(["--task", "force", *arguments])
-    assert stop.value.code == 2
+    assert main(["grid", "--task", "force", *arguments]) == 2
     said = capsys.readouterr().err.strip().splitlines()
     import re
 

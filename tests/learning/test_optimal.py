@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from scripts import optimum as script
+from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import PolicyFileError
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.learning import evaluation, optimal
@@ -434,9 +434,9 @@ def test_value_functions_that_are_missing_damaged_or_of_another_environment_are_
 def test_show_prints_the_stored_study_and_computes_nothing(monkeypatch, capsys, task, tier):
     monkeypatch.setattr(optimal, "value_iteration", None)
     monkeypatch.setattr(optimal, "find_optimum", None)
-    assert script.main(["--task", task, "--tier", tier, "--show"]) == 0
+    assert main(["optimum", "--task", task, "--tier", tier, "--show"]) == 0
     out = capsys.readouterr().out
-    study = optimal.stored_study(script.TIERS[tier][task])
+    study = optimal.stored_study({"nominal": optimal.TASKS, "randomised": optimal.RANDOMISED}[tier][task])
     for grid, estimate in study["value_estimates"].items():
         row = next(line for line in out.splitlines() if line.split()[:1] == [grid])
         found = [f"{value:.4f}" for name, value in study["stages"].items() if name.endswith(f" {grid}, refined")]
@@ -458,8 +458,7 @@ def test_show_prints_the_stored_study_and_computes_nothing(monkeypatch, capsys, 
     ],
 )
 def test_wrong_arguments_are_one_line(capsys, arguments, message):
-    with pytest.raises(SystemExit, match="2"):
-        script.main(["--task", "force", *arguments])
+    assert main(["optimum", "--task", "force", *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -471,14 +470,14 @@ def test_stopping_stores_nothing_and_says_so(monkeypatch, tmp_path, capsys):
 
     monkeypatch.setattr(optimal, "best_of", stop)
     small = ["--task", "force", "--draws", "1", "--grid", "9x9", "--beam", "0", "--rounds", "0"]
-    assert script.main([*small, "--output", str(tmp_path)]) == 130
-    assert capsys.readouterr().err.endswith("optimum.py: stopped; nothing was stored\n")
+    assert main(["optimum", *small, "--out", str(tmp_path)]) == 130
+    assert capsys.readouterr().err.endswith("sd-friction optimum: interrupted; nothing was stored\n")
     assert not list(tmp_path.iterdir())
 
 
 def test_nothing_stored_is_one_line(tmp_path, capsys):
-    assert script.main(["--task", "force", "--show", "--output", str(tmp_path)]) == 1
-    assert capsys.readouterr().err.startswith("optimum.py: error: no optimum is stored for 'SDFriction/Force-v0'")
+    assert main(["optimum", "--task", "force", "--show", "--out", str(tmp_path)]) == 1
+    assert capsys.readouterr().err.startswith("sd-friction optimum: no optimum is stored for 'SDFriction/Force-v0'")
 
 
 def test_randomised_run_stores_what_can_be_read_again(tmp_path, capsys):
@@ -496,7 +495,7 @@ def test_randomised_run_stores_what_can_be_read_again(tmp_path, capsys):
         "--rounds",
         "0",
     ]
-    assert script.main([*small, "--output", str(tmp_path)]) == 0
+    assert main(["optimum", *small, "--out", str(tmp_path)]) == 0
     seeds, actions = optimal.optimal_actions(RANDOMISED["force"], tmp_path)
     assert seeds == [1_000_000, 1_000_001]
     returns = optimal.optimal_returns(RANDOMISED["force"], seeds, tmp_path)

@@ -15,8 +15,8 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from scripts import train as train_script
 from sd_friction_env import Table, storage
+from sd_friction_env.cli.main import main
 from sd_friction_env.learning import runs, training
 
 ROOT = Path(__file__).parents[2]
@@ -271,7 +271,7 @@ def test_the_program_killed_with_signal_9_is_resumed_by_its_folder_alone(tmp_pat
             time.sleep(0.01)
         process.send_signal(signal.SIGKILL)
         assert process.wait(60) == -signal.SIGKILL
-    assert train_script.main(["--run-folder", str(tmp_path / "run"), "--resume", "--no-progress"]) == 0
+    assert main(["train", "--run-folder", str(tmp_path / "run"), "--resume", "--no-progress"]) == 0
     assert "4,000 steps" in capsys.readouterr().out
     training.train(tiny_plan(timesteps=4000), tmp_path / "whole", progress=False)
     assert content(tmp_path / "run") == content(tmp_path / "whole")
@@ -282,10 +282,8 @@ def test_the_program_killed_with_signal_9_is_resumed_by_its_folder_alone(tmp_pat
 
 
 def refused(capsys, *arguments):
-    with pytest.raises(SystemExit) as stop:
-        train_script.main(list(arguments))
+    assert main(["train", *list(arguments)]) == 2
     error = capsys.readouterr().err
-    assert stop.value.code == 2
     assert error.count("\n") == 1
     return error
 
@@ -297,17 +295,17 @@ def test_the_same_command_with_resume_begins_goes_on_and_says_when_it_is_finishe
     assert list(tmp_path.iterdir()) == []
     stopped(folder)
     assert "unfinished run" in refused(capsys, *command(folder))
-    assert train_script.main(command(folder, "--resume")) == 0
+    assert main(["train", *command(folder, "--resume")]) == 0
     assert "Resuming ppo on SDFriction/Force-v0: 600 steps, seed 7" in capsys.readouterr().out
     assert content(folder) == whole
     before = files(folder)
     for again in (command(folder), ["--run-folder", str(folder)]):
-        assert train_script.main([*again, "--resume"]) == 0
+        assert main(["train", *again, "--resume"]) == 0
         assert "is finished: there is nothing to resume" in capsys.readouterr().out
     with pytest.raises(runs.RunFolderError, match="is finished"):
         training.train(tiny_plan(), folder, resume=True, progress=False)
     assert files(folder) == before
-    assert train_script.main(command(tmp_path / "other", "--resume")) == 0  # nothing there yet: it begins
+    assert main(["train", *command(tmp_path / "other", "--resume")]) == 0  # nothing there yet: it begins
     assert content(tmp_path / "other") == whole
 
 
@@ -415,7 +413,7 @@ def test_no_flipped_bit_and_no_cut_of_a_checkpoint_goes_unnoticed(partial):
 def test_a_run_resumed_from_the_predecessor_ends_as_one_that_was_not_damaged(whole, partial, tmp_path, capsys):
     last, before = runs.checkpoints(partial)
     flip(last, 5000)
-    assert train_script.main(["--run-folder", str(tmp_path / "run"), "--resume", "--no-progress"]) == 0
+    assert main(["train", "--run-folder", str(tmp_path / "run"), "--resume", "--no-progress"]) == 0
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert last.name in error
@@ -492,7 +490,6 @@ def test_what_cannot_be_resumed_is_one_clear_error_and_nothing_is_written(damage
 FULL = """
 import errno, resource, sys
 from sd_friction_env.learning import runs
-from scripts import train
 
 save, count = runs.save_tensors, 0
 
@@ -505,7 +502,8 @@ def limited(path, content):
     save(path, content)
 
 runs.save_tensors = limited
-sys.exit(train.main(sys.argv[2:]))
+from sd_friction_env.cli.main import main
+sys.exit(main(["train", *sys.argv[2:]]))
 """
 
 
@@ -515,13 +513,13 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(whole, room, tmp_
     words = [sys.executable, "-c", FULL, str(room), *command(tmp_path / "run")]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1, done.stderr
-    assert "train.py: error: the run cannot be written" in done.stderr
+    assert "sd-friction train: the run cannot be written" in done.stderr
     assert "--resume" in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stderr.count("\n") == 1
     (checkpoint,) = (tmp_path / "run.partial" / "checkpoints").iterdir()
     assert runs.load_tensors(checkpoint, sealed=True)["steps"] == 128
-    assert train_script.main(["--run-folder", str(tmp_path / "run"), "--resume", "--no-progress"]) == 0
+    assert main(["train", "--run-folder", str(tmp_path / "run"), "--resume", "--no-progress"]) == 0
     assert content(tmp_path / "run") == whole
 
 
@@ -546,7 +544,7 @@ def test_a_second_process_on_one_run_is_refused_by_the_name_of_the_first(partial
         first.kill()  # what it leaves behind blocks nobody
     assert files(partial) == before
     assert (tmp_path / ".run.lock").exists()
-    assert train_script.main(["--run-folder", str(tmp_path / "run"), "--resume", "--no-progress"]) == 0
+    assert main(["train", "--run-folder", str(tmp_path / "run"), "--resume", "--no-progress"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 

@@ -19,9 +19,8 @@ import torch
 import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
-from scripts import evaluate as evaluate_script
-from scripts import train as train_script
 from sd_friction_env import ENVIRONMENT_IDS, Table, storage
+from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import load_policy
 from sd_friction_env.environments.wrappers import ScaledReward
 from sd_friction_env.learning import evaluation, runs, training
@@ -88,7 +87,7 @@ def test_a_run_folder_describes_itself(finished):
     assert config["environment"] == {"id": FORCE, "kwargs": SHORT, "frame_stack": 1}
     assert (config["algorithm"], config["seed"], config["steps"], config["status"]) == ("ppo", 0, 256, "finished")
     assert config["hyperparameters"]["policy_kwargs"]["activation_fn"] == "Tanh"
-    assert config["command"].startswith("python scripts/train.py --task force")
+    assert config["command"].startswith("sd-friction train --task force")
     assert {"torch", "stable_baselines3", "gymnasium", "sd_friction_env"} <= set(config["versions"])
     table = Table.from_csv(finished / "evaluations.csv")
     assert table["steps"].tolist() == [128.0, 256.0]
@@ -108,7 +107,7 @@ def test_the_two_forms_of_an_agent_act_alike_after_loading(finished):
 
 
 def test_the_evaluation_script_takes_the_folder(finished, tmp_path, capsys):
-    assert evaluate_script.main([str(finished), "--episodes", "2", "--csv", str(tmp_path / "a.csv")]) == 0
+    assert main(["evaluate", str(finished), "--episodes", "2", "--csv", str(tmp_path / "a.csv")]) == 0
     assert str(finished) in capsys.readouterr().out
     table = Table.from_csv(tmp_path / "a.csv")
     seeds = evaluation.EVALUATION_SEEDS[:2]
@@ -318,7 +317,10 @@ def test_a_pickle_in_place_of_the_weights_is_refused_and_never_run(copied, tmp_p
 
 
 def test_no_code_here_unpickles_or_evaluates():
-    for path in [*(ROOT / "agents").glob("*.py"), ROOT / "scripts/train.py", ROOT / "scripts/evaluate.py"]:
+    for path in [
+        *(ROOT / "sd_friction_env" / "learning").glob("*.py"),
+        *(ROOT / "sd_friction_env" / "cli").glob("*.py"),
+    ]:
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.Call):
                 continue
@@ -359,7 +361,7 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
         (["--algo", "a2c"], "'a2c'"),
         (["--task", "wheel"], "'wheel'"),
         (["--tier", "hidden"], "'hidden'"),
-        (["--env-id", FORCE], "one of --task (force, belt) and --env-id"),
+        (["--env-id", FORCE], "--env-id names task and tier itself"),
         (["--timesteps", "0"], "timesteps must be a whole number in [1, 1000000000000], got 0"),
         (["--timesteps", "many"], "'many'"),
         (["--envs", "-1"], "envs must be a whole number in [1, 65536], got -1"),
@@ -392,19 +394,15 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
     ],
 )
 def test_bad_arguments_are_one_line_and_status_2_before_anything_is_written(change, message, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        train_script.main([*tiny_command(tmp_path / "run"), *change])
+    assert main(["train", *tiny_command(tmp_path / "run"), *change]) == 2
     error = capsys.readouterr().err
-    assert stop.value.code == 2
     assert message in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_command_line_refuses_an_existing_folder(finished, capsys):
-    with pytest.raises(SystemExit) as stop:
-        train_script.main(tiny_command(finished))
-    assert stop.value.code == 2
+    assert main(["train", *tiny_command(finished)]) == 2
     assert "--force" in capsys.readouterr().err
 
 

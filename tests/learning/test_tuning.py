@@ -16,9 +16,8 @@ import pytest
 import yaml
 from optuna.trial import FixedTrial, TrialState
 
-from scripts import train as train_script
-from scripts import tune as tune_script
 from sd_friction_env import ENVIRONMENT_IDS, Table
+from sd_friction_env.cli.main import main
 from sd_friction_env.learning import evaluation, runs, training, tuning
 
 ROOT = Path(__file__).parents[2]
@@ -352,7 +351,7 @@ def command(storage, *more):
 
 def test_ctrl_c_leaves_a_study_that_the_same_command_continues_and_training_takes_its_best(storage, tmp_path, capsys):
     out = tmp_path / "best.yml"
-    endless = [sys.executable, "-W", "error", "scripts/tune.py", *command(storage, "--trials", "100000")]
+    endless = [sys.executable, "-W", "error", "-m", "sd_friction_env", "tune", *command(storage, "--trials", "100000")]
     search = tiny_search()
     with subprocess.Popen(endless, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True) as program:
         try:
@@ -373,13 +372,13 @@ def test_ctrl_c_leaves_a_study_that_the_same_command_continues_and_training_take
     assert finished >= 1
     assert not study.get_trials(states=[TrialState.RUNNING])
     # With all trials done, the same command says what came out.
-    assert tune_script.main(command(storage, "--trials", str(finished), "--out", str(out))) == 0
+    assert main(["tune", *command(storage, "--trials", str(finished), "--out", str(out))]) == 0
     assert f"{finished} trials:" in capsys.readouterr().out
     best = tuning.best_trials(study)[0]
     assert training.read_hyperparameters("ppo", FORCE, out).items() >= best.user_attrs["hyperparameters"].items()
     folder = tmp_path / "run"
     words = ["--task", "force", "--algo", "ppo", "--hyperparameters", str(out), "--run-folder", str(folder)]
-    assert train_script.main([*words, "--no-progress", "--env-arg", "episode_steps=40"]) == 0
+    assert main(["train", *words, "--no-progress", "--env-arg", "episode_steps=40"]) == 0
     assert runs.load_config(folder)["hyperparameters"].items() >= best.user_attrs["hyperparameters"].items()
 
 
@@ -408,16 +407,14 @@ def _states(database):
         (["--seed", "-1"], r"seed must be a whole number in \[0, 4294967295\], got -1"),
         (["--timesteps", "0"], r"timesteps must be a whole number"),
         (["--study", " "], r"study must be a name of 1 to 200 characters"),
-        (["--top", "0"], r"--top must be a whole number >= 1, got 0"),
+        (["--top", "0"], r"--top must be at least 1, got 0"),
         (["--set", "gama=1"], r"ppo has no hyperparameter 'gama'"),
         (["--hyperparameters", "nowhere.yml"], r"hyperparameters cannot be read from 'nowhere.yml'"),
         (["--out", "/no/such/folder/best.yml"], r"out must be a file in a folder that exists"),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(more, said, storage, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        tune_script.main(command(storage, "--trials", "1", *more))
-    assert stopped.value.code == 2
+    assert main(["tune", *command(storage, "--trials", "1", *more)]) == 2
     errors = capsys.readouterr().err
     assert len(errors.splitlines()) == 1
     assert re.search(said, errors)
@@ -430,8 +427,7 @@ def test_files_of_others_are_left_alone(storage, tmp_path, capsys):
     mine.write_text("precious: 1\n")
     (tmp_path / "study.db").write_text("no database, " * 100)
     for more, said in ((["--out", str(mine)], "no file of this program"), ([], "file is not a database")):
-        with pytest.raises(SystemExit):
-            tune_script.main(command(storage, "--trials", "1", *more))
+        assert main(["tune", *command(storage, "--trials", "1", *more)]) == 2
         errors = capsys.readouterr().err
         assert len(errors.splitlines()) == 1
         assert said in errors

@@ -1,0 +1,80 @@
+"""Agents and controllers as commands name them."""
+
+from pathlib import Path
+from typing import Any
+
+from sd_friction_env import ENVIRONMENT_IDS, load_pretrained
+from sd_friction_env.cli.options import UsageError
+from sd_friction_env.control.policies import NetworkPolicy, Policy, VelocityFeedback, ZeroPolicy, load_policy
+from sd_friction_env.learning import evaluation, runs
+
+# On force near the best there is. On belt the belt follows the mass, which makes matters worse at any gain.
+VELOCITY_GAINS = {"force": 1.5, "belt_speed": 1.0}
+
+
+def stored_agent(path: Path) -> tuple[NetworkPolicy, dict[str, Any] | None]:
+    """Return the agent at a path and, from a run folder, the environment that it was trained for: id and kwargs.
+
+    Raises:
+        ValueError: if it is neither a finished run folder nor a policy file.
+    """
+    if path.suffix.lower() == ".npz":
+        try:
+            return load_policy(path), None
+        except OSError as error:
+            raise UsageError(f"{str(path)!r} cannot be read: {error}") from None
+    config = runs.load_config(path)
+    return runs.load_network(path), dict(config["environment"])
+
+
+def check_fit(path: Path, policy: NetworkPolicy, env_id: str, env_kwargs: dict[str, Any]) -> None:
+    """Check that an agent fits an environment.
+
+    Raises:
+        UsageError: if its observations have another size, or it was trained with another actuator.
+    """
+    env = evaluation.make_env(env_id, env_kwargs)
+    size = env.observation_space.shape[0] if env.observation_space.shape else 0
+    if policy.observation_size != size:
+        raise UsageError(f"{str(path)!r} observes {policy.observation_size} values, and {env_id} gives {size}")
+    trained = policy.metadata.get("env_id")
+    if trained in ENVIRONMENT_IDS and evaluation.make_env(trained).task.actuator != env.task.actuator:
+        raise UsageError(f"{str(path)!r} was trained on {trained}, whose actuator is not that of {env_id}")
+
+
+def velocity_feedback(env_id: str, env_kwargs: dict[str, Any], gain: float | None) -> tuple[VelocityFeedback, float]:
+    """Return velocity feedback for an environment, and its gain (None: the default of the actuator)."""
+    env = evaluation.make_env(env_id, env_kwargs)
+    used = VELOCITY_GAINS[env.task.actuator] if gain is None else gain
+    return VelocityFeedback.from_env(env, used), used
+
+
+def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
+    """Return the controller that --agent names: pretrained, passive, velocity-feedback, a run folder or a .npz file.
+
+    Raises:
+        ValueError: if there is no such agent, or it does not fit the environment.
+    """
+    if gain is not None and name != "velocity-feedback":
+        raise UsageError(f"--gain goes with --agent velocity-feedback, not with {name!r}")
+    if name == "pretrained":
+        return load_pretrained(env_id)
+    if name == "passive":
+        return ZeroPolicy()
+    if name == "velocity-feedback":
+        return velocity_feedback(env_id, {}, gain)[0]
+    path = Path(name)
+    if path.suffix.lower() != ".npz" and not path.is_dir():
+        raise UsageError(
+            f"--agent must be pretrained, velocity-feedback, passive, a run folder or a policy's .npz, got {name!r}"
+        )
+    policy, _ = stored_agent(path)
+    check_fit(path, policy, env_id, {})
+    return policy
+
+
+def title_of(name: str, policy: Policy) -> str:
+    """Return what a picture calls the controller that --agent names."""
+    titles = {"passive": "no control", "velocity-feedback": "velocity feedback"}
+    algorithm = str(getattr(policy, "metadata", {}).get("algorithm", "trained"))
+    return titles.get(name, f"{algorithm.upper()} agent")

@@ -1,0 +1,315 @@
+"""Passive and forced analysis: amplitude, cycle, critical, simulate, basins, poincare, lyapunov, bifurcation."""
+
+import argparse
+import dataclasses
+import itertools
+import math
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from sd_friction_env.cli.options import (
+    FAILURE,
+    Command,
+    UsageError,
+    add_engine,
+    add_oscillator,
+    add_output,
+    add_start,
+    check_output,
+    emit,
+    engine_of,
+    grid_of,
+    metadata_of,
+    numbers,
+    one_of,
+    progress_bar,
+    stacked,
+    start_of,
+    with_columns,
+)
+from sd_friction_env.physics import sweeps
+from sd_friction_env.physics.basins import LOST_CONTACT, UNDECIDED, basin_grid
+from sd_friction_env.physics.curves import checked_belt_speeds
+from sd_friction_env.physics.forced import lyapunov_exponent, poincare_section
+from sd_friction_env.physics.orbits import critical_belt_speeds, first_lyapunov_coefficient, limit_cycle
+from sd_friction_env.physics.parameters import OscillatorParameters
+from sd_friction_env.physics.simulation import simulate
+from sd_friction_env.physics.tables import Table
+from sd_friction_env.pictures import plotting
+
+
+def _amplitude(options: argparse.Namespace) -> int:
+    grid = grid_of(options, belt_speed=False)
+    given = options.belt_speed or [numbers("0:0.6:0.005")]
+    speeds = checked_belt_speeds(list(itertools.chain.from_iterable(given)))
+    x, v = start_of(options)
+    if options.attractors and options.start is not None:
+        raise UsageError("--start and --attractors exclude each other: all attractors need no start")
+    curves = sweeps.amplitude_sweep(
+        [parameters for _, parameters in grid], speeds, engine_of(options), x=x, v=v, all_attractors=options.attractors
+    )
+    table = stacked(
+        (with_columns(curve, swept) for curve, (swept, _) in zip(curves, grid, strict=True)), metadata_of(options)
+    )
+    emit(options, table)
+    if options.plot is not None:
+        plotting.save_figure(plotting.draw_amplitude_table(table, [swept for swept, _ in grid]), options.plot)
+    return 0
+
+
+def _cycle(options: argparse.Namespace) -> int:
+    grid = grid_of(options)
+    x, v = start_of(options)
+    show = progress_bar(len(grid), "cycles")
+    rows = []
+    for done, (swept, parameters) in enumerate(grid, start=1):
+        cycle = limit_cycle(parameters, x, v)
+        fields = [field.name for field in dataclasses.fields(cycle) if field.name != "parameters"]
+        rows.append(swept | {name: getattr(cycle, name) for name in fields})
+        show(done)
+    table = Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options))
+    if len(rows) == 1 and options.out is None and not options.json:
+        for name, value in rows[0].items():
+            print(f"{name:22}{value if isinstance(value, str) else format(value, '.12g')}")
+    else:
+        emit(options, table)
+    return 0
+
+
+def _critical(options: argparse.Namespace) -> int:
+    if options.belt_speed is not None:
+        raise UsageError("--belt-speed is what this command finds: leave it out")
+    grid = grid_of(options, belt_speed=False)
+    show = progress_bar(len(grid), "oscillators")
+    rows: list[dict[str, Any]] = []
+    for done, (swept, parameters) in enumerate(grid, start=1):
+        speeds = critical_belt_speeds(parameters)
+        coefficient = first_lyapunov_coefficient(parameters)
+        hopf = "" if math.isnan(coefficient) else "supercritical" if coefficient < 0.0 else "subcritical"
+        numbers_ = {"v_b0": speeds.v_b0, "v_b1": speeds.v_b1, "first_lyapunov_coefficient": coefficient}
+        rows.append(swept | numbers_ | {"hopf": hopf, "reason": speeds.reason})
+        show(done)
+    emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options)))
+    return 0
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    parameters = one_of(options)
+    x, v = start_of(options)
+    history = simulate(parameters, x, v, options.t_end, dt=options.dt, force=options.force)
+    table = history.to_table()
+    events = [list(event) for event in history.events]
+    table.metadata = metadata_of(options) | {"status": history.status, "events": events}
+    emit(options, table)
+    if options.plot is not None:
+        plotting.save_figure(plotting.draw_history(history), options.plot)
+    if history.status != "ok":
+        print(f"sd-friction simulate: {history.status} at t = {history.t[-1]:.6g}", file=sys.stderr)
+        return FAILURE
+    return 0
+
+
+def _basins(options: argparse.Namespace) -> int:
+    parameters = one_of(options)
+    x_limits, v_limits, shape = tuple(options.x), tuple(options.v), tuple(options.shape)
+    if options.backend == "sequential" and options.folder is None:
+        engine_of(options)  # refuses what does not go with it
+        x, v, found = basin_grid(parameters, x_limits, v_limits, shape)  # on all cores
+    else:
+        x, v, found = sweeps.basin_sweep(parameters, x_limits, v_limits, shape, engine_of(options))
+    names = [f"{cycle.kind} round x = {0.5 * (cycle.x_max + cycle.x_min):.4f}" for cycle in found.attractors]
+    rows: list[dict[str, Any]] = []
+    for label, name in [*enumerate(names), (LOST_CONTACT, "contact lost"), (UNDECIDED, "undecided")]:
+        share, error = found.fraction(label)
+        size = found.attractors[label].amplitude if label >= 0 else math.nan
+        rows.append({"label": label, "attractor": name, "amplitude": size, "fraction": share, "standard_error": error})
+    emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options)))
+    if options.plot is not None:
+        figure, axes = plotting.new_figure(6.8, 4.8, 1, 1)
+        plotting.draw_basins(axes[0, 0], x, v, found)
+        plotting.save_figure(figure, options.plot)
+    return 0
+
+
+def _poincare(options: argparse.Namespace) -> int:
+    x, v = start_of(options)
+    section = poincare_section(one_of(options), x, v, cycles=options.cycles, transient=options.transient)
+    section.metadata = metadata_of(options)
+    emit(options, section)
+    if options.plot is not None:
+        figure, axes = plotting.new_figure(5.4, 4.6, 1, 1)
+        plotting.draw_section(axes[0, 0], section)
+        plotting.save_figure(figure, options.plot)
+    return 0
+
+
+def _lyapunov(options: argparse.Namespace) -> int:
+    grid = grid_of(options)
+    x, v = start_of(options)
+    show = progress_bar(len(grid), "motions")
+    rows = []
+    for done, (swept, parameters) in enumerate(grid, start=1):
+        found = lyapunov_exponent(parameters, x, v, cycles=options.cycles, transient=options.transient)
+        told = {"largest": found.largest, "standard_error": found.standard_error}
+        exponents = {"first": found.exponents[0], "second": found.exponents[1]}
+        rows.append(swept | told | exponents | {"singular_events": found.singular_events, "cycles": found.cycles})
+        show(done)
+    emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options)))
+    return 0
+
+
+def _bifurcation(options: argparse.Namespace) -> int:
+    name, *texts = options.over
+    name = name.replace("-", "_")
+    try:
+        values = list(itertools.chain.from_iterable(numbers(text) for text in texts))
+    except argparse.ArgumentTypeError as error:
+        raise UsageError(f"--over {options.over[0]}: {error}") from None
+    grid = grid_of(options)
+    if name in grid[0][0]:
+        raise UsageError(f"--over and --{options.over[0]} are one parameter: give it once")
+    tables = sweeps.bifurcation_sweep(
+        [parameters for _, parameters in grid],
+        name,
+        values,
+        engine_of(options),
+        direction=options.direction,
+        cycles=options.cycles,
+        transient=options.transient,
+        lyapunov=options.exponents,
+    )
+    table = stacked(
+        (with_columns(part, swept) for part, (swept, _) in zip(tables, grid, strict=True)), metadata_of(options)
+    )
+    emit(options, table)
+    if options.plot is not None:
+        figure, axes = plotting.new_figure(7.0, 4.4, 1, 1)
+        plotting.draw_bifurcation(axes[0, 0], tables[0])
+        plotting.save_figure(figure, options.plot)
+    return 0
+
+
+# Options --------------------------------------------------------------------------------------------------------------
+
+
+def _add_amplitude(parser: argparse.ArgumentParser) -> None:
+    add_start(parser)
+    parser.add_argument("--attractors", action="store_true", help="all attractors of every point, whatever the start")
+    add_engine(parser)
+    add_output(parser, "amplitude over the belt speed")
+
+
+def _add_cycle(parser: argparse.ArgumentParser) -> None:
+    add_start(parser)
+    add_output(parser, None)
+
+
+def _add_critical(parser: argparse.ArgumentParser) -> None:
+    add_output(parser, None)
+
+
+def _add_simulate(parser: argparse.ArgumentParser) -> None:
+    add_start(parser)
+    parser.add_argument("--t-end", type=float, default=100.0, help="when to end (default: 100)")
+    parser.add_argument("--dt", type=float, default=0.01, help="time between samples (default: 0.01)")
+    parser.add_argument("--force", type=float, default=0.0, help="constant control force (default: 0)")
+    add_output(parser, "displacement, velocity and phase portrait")
+
+
+def _add_basins(parser: argparse.ArgumentParser) -> None:
+    add_engine(parser)
+    for name, default in (("--x", (-1.5, 1.5)), ("--v", (-1.0, 1.0))):
+        text = f"starts in {name[2:]} (default: {default[0]} {default[1]})"
+        parser.add_argument(name, nargs=2, type=float, default=default, metavar=("LOW", "HIGH"), help=text)
+    parser.add_argument("--shape", nargs=2, type=int, default=[400, 400], metavar=("N", "M"), help="grid (400 400)")
+    add_output(parser, "the basins")
+
+
+def _add_cycles(parser: argparse.ArgumentParser, default: int) -> None:
+    text = f"drive periods recorded (default: {default})"
+    parser.add_argument("--cycles", type=int, default=default, metavar="N", help=text)
+    text = "drive periods before them (default: 200)"
+    parser.add_argument("--transient", type=int, default=200, metavar="N", help=text)
+
+
+def _add_poincare(parser: argparse.ArgumentParser) -> None:
+    add_start(parser)
+    _add_cycles(parser, 1000)
+    add_output(parser, "the section")
+
+
+def _add_lyapunov(parser: argparse.ArgumentParser) -> None:
+    add_start(parser)
+    _add_cycles(parser, 2000)
+    add_output(parser, None)
+
+
+def _add_bifurcation(parser: argparse.ArgumentParser) -> None:
+    text = "the parameter, and its values or ranges"
+    parser.add_argument("--over", nargs="+", required=True, metavar=("NAME", "VALUE"), help=text)
+    parser.add_argument("--direction", choices=("up", "down", "both"), default="both", help="(default: both)")
+    _add_cycles(parser, 60)
+    parser.add_argument("--exponents", action="store_true", help="the largest Lyapunov exponent of each as well")
+    add_engine(parser)
+    add_output(parser, "the diagram")
+
+
+def _command(
+    add: Callable[[argparse.ArgumentParser], None], run: Callable[[argparse.Namespace], int], *examples: str
+) -> Command:
+    def add_all(parser: argparse.ArgumentParser) -> None:
+        parser.usage = f"{parser.prog} [options]"  # the list of all takes a page
+        add_oscillator(parser)
+        add(parser)
+
+    def check_and_run(options: argparse.Namespace) -> int:
+        check_output(options)
+        limit_cycle(OscillatorParameters())  # compiled here, so that progress bars time the work alone
+        return run(options)
+
+    return Command(add_all, check_and_run, examples)
+
+
+_FORCED = "--force-amplitude 0.2 --force-frequency 1.3"
+
+COMMANDS = {
+    "amplitude": _command(
+        _add_amplitude,
+        _amplitude,
+        "--belt-speed 0:0.6:0.005",
+        "--alpha 0.2 0.5 0.7 0.8 --belt-speed 0:0.6:0.005 --geometry cubic --out curve.csv --plot curve.png",
+        "--alpha 0.5 --belt-speed 0.4:0.45:0.001 --attractors",
+        "--alpha 0.2:1:0.01 --belt-speed 0:0.6:0.001 --backend loky --folder map --out map.csv",
+    ),
+    "cycle": _command(_add_cycle, _cycle, "", "--geometry cubic --belt-speed 0.405 --json", "--alpha 0.2 --start -1 0"),
+    "critical": _command(
+        _add_critical, _critical, "", "--geometry cubic exact linear --alpha 0.2:0.8:0.1", "--mu-m 0.1575 --json"
+    ),
+    "simulate": _command(
+        _add_simulate,
+        _simulate,
+        "--t-end 60 --out history.csv --plot history.png",
+        "--start 0.3 -0.4 --dt 0.1 --force 0.02",
+    ),
+    "basins": _command(
+        _add_basins,
+        _basins,
+        "--alpha 0.2 --plot basins.png",
+        "--alpha 0.5 --belt-speed 0.43 --x -1.5 1.5 --v -1 1 --shape 800 800",
+        "--alpha 0.5 --shape 4000 2500 --backend dask --address tcp://10.0.0.1:8786 --folder basins-alpha-5",
+    ),
+    "poincare": _command(_add_poincare, _poincare, f"{_FORCED} --cycles 2000 --out section.csv --plot section.png"),
+    "lyapunov": _command(
+        _add_lyapunov,
+        _lyapunov,
+        _FORCED,
+        "--force-amplitude 0.05:0.3:0.01 --force-frequency 1.3 --out exponents.csv",
+        "--belt-speed 0.42",
+    ),
+    "bifurcation": _command(
+        _add_bifurcation,
+        _bifurcation,
+        "--force-frequency 1.3 --over force-amplitude 0.01:0.3:0.002 --backend loky --plot diagram.png",
+    ),
+}

@@ -188,7 +188,7 @@ class LinearFeedback:
     """
 
     gains: tuple[float, ...]
-    readings: Readings
+    readings: Readings = dataclasses.field(repr=False)
     bias: float = 0.0
 
     def __post_init__(self) -> None:
@@ -237,7 +237,7 @@ class VelocityFeedback:
     """
 
     gain: float
-    readings: Readings
+    readings: Readings = dataclasses.field(repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "gain", checked_number("gain", self.gain, -_LARGEST_GAIN, _LARGEST_GAIN))
@@ -287,7 +287,7 @@ class FilteredFeedback:
     v_gain: float
     pole: float
     control_interval: float
-    readings: Readings
+    readings: Readings = dataclasses.field(repr=False)
     bias: float = 0.0
     amplitude: float = 1.0
 
@@ -336,7 +336,7 @@ class DelayedFeedback:
 
     gain: float
     delay: int
-    readings: Readings
+    readings: Readings = dataclasses.field(repr=False)
 
     def __post_init__(self) -> None:
         _check_numbers(self, {"gain": _GAINS, "delay": (1.0, 1000.0)})
@@ -385,7 +385,7 @@ class SlidingMode:
 
     slope: float
     layer: float
-    readings: Readings
+    readings: Readings = dataclasses.field(repr=False)
     amplitude: float = 1.0
 
     def __post_init__(self) -> None:
@@ -497,6 +497,12 @@ class NetworkPolicy:
         if self.frames < 1 or inputs < 1 or inputs % self.frames:
             raise ValueError(f"{inputs} inputs cannot be {self.frames} observations")
         object.__setattr__(self, "layers", layers)
+
+    def __repr__(self) -> str:
+        sizes = "-".join(str(size) for size in (self.layers[0][0].shape[0], *(len(bias) for _, bias in self.layers)))
+        window = f" of {self.frames} observations" if self.frames > 1 else ""
+        origin = " ".join(str(self.metadata[key]) for key in ("algorithm", "env_id") if key in self.metadata)
+        return f"NetworkPolicy({sizes}{window}, {self.activation}, {self.output}{', ' + origin if origin else ''})"
 
     @property
     def observation_size(self) -> int:

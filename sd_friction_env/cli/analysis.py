@@ -142,7 +142,8 @@ def _basins(options: argparse.Namespace) -> int:
                 options.out, {"x": x, "v": v, "labels": found.labels, "metadata": np.array(json.dumps(metadata))}
             )
         else:
-            columns: dict[str, Any] = {"x": np.tile(x, len(v)), "v": np.repeat(v, len(x)), "label": found.labels.ravel()}
+            grid_x, grid_v = np.meshgrid(x, v)
+            columns: dict[str, Any] = {"x": grid_x.ravel(), "v": grid_v.ravel(), "label": found.labels.ravel()}
             emit(options, Table(columns, metadata))
     if options.plot is not None:
         figure, axes = plotting.new_figure(6.8, 4.8, 1, 1)

@@ -316,7 +316,7 @@ def draw_basins(axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], fo
         if share > 0.0:
             text = f"{names[label + 2]}, {100.0 * share:.1f}%"
             patches.append(Patch(facecolor=colours[label + 2], edgecolor="0.6", label=text))
-    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=4, frameon=False)
+    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.17), ncols=4, frameon=False)
 
 
 @house_style()

@@ -125,7 +125,7 @@ def draw_3(
         points = (controlled or {}).get(geometry, {})
         plotting.draw_controlled_points(axis, points)
         if points and trained is not None:
-            label = f"trained at $v_b = {trained:g}$ only"
+            label = f"trained at $v_b = {trained:g}$"
             axis.axvline(trained, color=plotting.GREEN, linewidth=1.2, linestyle=":", label=label)
         axis.set(xlim=(0.0, 0.6), ylim=(-0.012, 0.6), xlabel=r"belt speed $v_b$")
         axis.set_title(title, fontsize=10, loc="left")

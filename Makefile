@@ -97,7 +97,7 @@ benchmark-peers: ## make .venv-peers with EnvPool and gymnax: `make benchmark` t
 	"$(PEERS_RUN)" $(PIP) install -r benchmark_peers.txt
 
 figures: setup ## compute and draw the paper's figures again
-	for name in 2 3 4 5 basins linear chaos control; do "$(RUN)" scripts/figure_$$name.py || exit 1; done
+	"$(RUN)" scripts/figures $(ARGS)
 
 report: setup ## evaluate every controller on every task; write report_output/report.html (a minute)
 	"$(RUN)" -m sd_friction_env report $(ARGS)

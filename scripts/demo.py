@@ -17,15 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from scripts import figure_3, figures
+from scripts.figures import common, paper
 from sd_friction_env import OscillatorParameters, SDFrictionEnv, Table, limit_cycle, simulate
-from sd_friction_env.control.policies import Policy, VelocityFeedback, ZeroPolicy
-from sd_friction_env.learning import evaluation, training
+from sd_friction_env.control.policies import Policy, ZeroPolicy
+from sd_friction_env.learning import classical, evaluation, training
 from sd_friction_env.physics.simulation import Trajectory, amplitude
 from sd_friction_env.pictures import plotting
 
 TASKS = {"force": "SDFriction/Force-v0", "belt": "SDFriction/BeltSpeed-v0"}
-VELOCITY_GAINS = {"force": 1.5, "belt": 1.5}  # force: near the best (any gain from 1 to 2); belt: it does harm at any
 SWEPT_BELT_SPEEDS = np.arange(0.05, 0.451, 0.025)
 SWITCH_ON = 300  # control intervals of passive motion in the histories
 
@@ -80,11 +79,11 @@ def switched_on(policy: Policy, env_id: str) -> Trajectory:
 
 def passive_curve(out: Path) -> Table:
     """Compute and draw Fig. 3; return its table."""
-    figure_3.compute().to_csv(out / "figure_3.csv")
+    paper.compute_3().to_csv(out / "figure_3.csv")
     table = Table.from_csv(out / "figure_3.csv")
-    figure_3.draw(table, out / "figure_3.png")
+    paper.draw_3(table, out / "figure_3.png")
     for geometry in ("cubic", "exact"):
-        row = figures.select(table, geometry=geometry)
+        row = common.select(table, geometry=geometry)
         peak = np.nanmax(row["amplitude"])
         print(f"{geometry:6} v_b0 {row['v_b0'][0]:.6f}   v_b1 {row['v_b1'][0]:.6f}   greatest amplitude {peak:.4f}")
     cycle = limit_cycle(OscillatorParameters())
@@ -139,8 +138,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         heading("4/4  Passive, classical and learned on the same 100 starts")
         rows = []
         for task, env_id in TASKS.items():
-            feedback = VelocityFeedback.from_env(evaluation.make_env(env_id), VELOCITY_GAINS[task])
-            policies: dict[str, Policy] = {"passive": ZeroPolicy(), "velocity feedback": feedback, "PPO": learned[task]}
+            gains = classical.stored_gains()[env_id]
+            best = max(gains, key=lambda name: gains[name]["validation_return"])
+            feedback = classical.classical_controllers(env_id)[best]
+            policies: dict[str, Policy] = {"passive": ZeroPolicy(), f"{best}, tuned": feedback, "PPO": learned[task]}
             rows += compare(task, policies)
         print(evaluation.format_summary(rows))
         print("\nscore: 0 passive, 1 optimal; suppressed: share of episodes that end still, slipping, at nominal speed")
@@ -151,7 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for task, env_id in TASKS.items():
             amplitudes = [closed_loop_amplitude(learned[task], env_id, speed) for speed in SWEPT_BELT_SPEEDS.tolist()]
             points[f"PPO by {task}"] = (SWEPT_BELT_SPEEDS.tolist(), amplitudes)
-        figure_3.draw(table, out / "figure_3_controlled.png", {"exact": points})
+        paper.draw_3(table, out / "figure_3_controlled.png", {"exact": points}, OscillatorParameters().belt_speed)
         histories = {f"control by {task}": switched_on(learned[task], env_id) for task, env_id in TASKS.items()}
         when = SWITCH_ON * evaluation.make_env(TASKS["force"]).task.control_interval
         figure = plotting.draw_before_and_after(histories, when, "Before and after control is switched on")

@@ -17,8 +17,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from scripts import figure_3, figure_4, figure_5
-from scripts.figures import PANELS
+from scripts.figures import paper
+from scripts.figures.common import PANELS
 from scripts.reference_numbers import Report
 from sd_friction_env import OscillatorParameters, SDFrictionEnv, attractors, critical_belt_speeds, limit_cycle, simulate
 from sd_friction_env.physics.basins import basins
@@ -26,7 +26,7 @@ from sd_friction_env.physics.curves import amplitude_curve
 from sd_friction_env.physics.orbits import rest_place
 
 NOMINAL = OscillatorParameters()
-ALPHAS = figure_4.ALPHAS
+ALPHAS = paper.ALPHAS
 
 
 def timed(work: Callable[[], object], repeats: int = 3) -> float:
@@ -44,10 +44,10 @@ def speed(report: Report) -> None:
     report.head("Speed, on one core with a warm cache, seconds")
 
     def figures() -> None:
-        for figure in (figure_3, figure_4, figure_5):
-            figure.compute()
+        for compute in (paper.compute_3, paper.compute_4, paper.compute_5):
+            compute()
 
-    points = sum(figure.compute().n_rows for figure in (figure_3, figure_4, figure_5))
+    points = sum(compute().n_rows for compute in (paper.compute_3, paper.compute_4, paper.compute_5))
     report.below(f"all {points} points of Figs. 3 to 5", timed(figures), 1.0)
 
     speeds = np.linspace(0.02, 0.6, 30)
@@ -95,7 +95,7 @@ def transient(p: OscillatorParameters, t_end: float) -> float:
 def slow_transients(report: Report) -> None:
     """The end of oscillation where transients last longest: (mu_s - mu_m)/v_m = .085."""
     report.head("(mu_s - mu_m)/v_m = .085, cubic: the end of oscillation, and what a run of 600 time units still shows")
-    p = figure_5.plant("cubic", 0.085)
+    p = paper.plant("cubic", 0.085)
     v_b1 = critical_belt_speeds(p).v_b1
     report.row("v_b1", 0.1088, v_b1, 5.1e-5)
     for belt in (0.15, 0.2, 0.25):

@@ -3,10 +3,13 @@
 import argparse
 import dataclasses
 import itertools
+import json
 import math
 import sys
 from collections.abc import Callable
 from typing import Any
+
+import numpy as np
 
 from sd_friction_env.cli.options import (
     FAILURE,
@@ -23,6 +26,7 @@ from sd_friction_env.cli.options import (
     metadata_of,
     numbers,
     one_of,
+    print_table,
     progress_bar,
     stacked,
     start_of,
@@ -30,13 +34,14 @@ from sd_friction_env.cli.options import (
 )
 from sd_friction_env.physics import sweeps
 from sd_friction_env.physics.basins import LOST_CONTACT, UNDECIDED, basin_grid
-from sd_friction_env.physics.curves import checked_belt_speeds
+from sd_friction_env.physics.curves import checked_belt_speeds, refined_curve
 from sd_friction_env.physics.forced import lyapunov_exponent, poincare_section
 from sd_friction_env.physics.orbits import critical_belt_speeds, first_lyapunov_coefficient, limit_cycle
 from sd_friction_env.physics.parameters import OscillatorParameters
 from sd_friction_env.physics.simulation import simulate
 from sd_friction_env.physics.tables import Table
 from sd_friction_env.pictures import plotting
+from sd_friction_env.storage import save_arrays
 
 
 def _amplitude(options: argparse.Namespace) -> int:
@@ -54,6 +59,9 @@ def _amplitude(options: argparse.Namespace) -> int:
     )
     emit(options, table)
     if options.plot is not None:
+        if not options.attractors:  # lines, which want the points at which they end
+            refined = (with_columns(refined_curve(plant, speeds, x=x, v=v), swept) for swept, plant in grid)
+            table = stacked(refined, {})
         plotting.save_figure(plotting.draw_amplitude_table(table, [swept for swept, _ in grid]), options.plot)
     return 0
 
@@ -119,12 +127,24 @@ def _basins(options: argparse.Namespace) -> int:
     else:
         x, v, found = sweeps.basin_sweep(parameters, x_limits, v_limits, shape, engine_of(options))
     names = [f"{cycle.kind} round x = {0.5 * (cycle.x_max + cycle.x_min):.4f}" for cycle in found.attractors]
+    named = dict(enumerate(names)) | {LOST_CONTACT: "contact lost", UNDECIDED: "undecided"}
     rows: list[dict[str, Any]] = []
-    for label, name in [*enumerate(names), (LOST_CONTACT, "contact lost"), (UNDECIDED, "undecided")]:
+    for label, name in named.items():
         share, error = found.fraction(label)
         size = found.attractors[label].amplitude if label >= 0 else math.nan
         rows.append({"label": label, "attractor": name, "amplitude": size, "fraction": share, "standard_error": error})
-    emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options)))
+    shares = Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options))
+    print_table(options, shares)
+    if options.out is not None:
+        metadata = shares.metadata | {"labels": {str(label): name for label, name in named.items()}}
+        if options.out.suffix.lower() == ".npz":
+            save_arrays(
+                options.out, {"x": x, "v": v, "labels": found.labels, "metadata": np.array(json.dumps(metadata))}
+            )
+        else:
+            grid_x, grid_v = np.meshgrid(x, v)
+            columns: dict[str, Any] = {"x": grid_x.ravel(), "v": grid_v.ravel(), "label": found.labels.ravel()}
+            emit(options, Table(columns, metadata))
     if options.plot is not None:
         figure, axes = plotting.new_figure(6.8, 4.8, 1, 1)
         plotting.draw_basins(axes[0, 0], x, v, found)
@@ -179,10 +199,9 @@ def _bifurcation(options: argparse.Namespace) -> int:
         transient=options.transient,
         lyapunov=options.exponents,
     )
-    table = stacked(
-        (with_columns(part, swept) for part, (swept, _) in zip(tables, grid, strict=True)), metadata_of(options)
-    )
-    emit(options, table)
+    parts = (with_columns(part, swept) for part, (swept, _) in zip(tables, grid, strict=True))
+    named = ({name if column == "value" else column: data for column, data in part.items()} for part in parts)
+    emit(options, stacked(named, metadata_of(options)))
     if options.plot is not None:
         figure, axes = plotting.new_figure(7.0, 4.4, 1, 1)
         plotting.draw_bifurcation(axes[0, 0], tables[0])
@@ -223,7 +242,8 @@ def _add_basins(parser: argparse.ArgumentParser) -> None:
         text = f"starts in {name[2:]} (default: {default[0]} {default[1]})"
         parser.add_argument(name, nargs=2, type=float, default=default, metavar=("LOW", "HIGH"), help=text)
     parser.add_argument("--shape", nargs=2, type=int, default=[400, 400], metavar=("N", "M"), help="grid (400 400)")
-    add_output(parser, "the basins")
+    add_output(parser, "the basins", out="the label of each start to FILE.npz, .csv or .json (the shares are printed)")
+    parser.set_defaults(out_endings=(".npz", ".csv", ".json"))
 
 
 def _add_cycles(parser: argparse.ArgumentParser, default: int) -> None:

@@ -309,9 +309,11 @@ def add_start(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", nargs=2, type=float, metavar=("X", "V"), help=text)
 
 
-def add_output(parser: argparse.ArgumentParser, plot: str | None) -> None:
+def add_output(
+    parser: argparse.ArgumentParser, plot: str | None, out: str = "to FILE.csv or FILE.json (default: print)"
+) -> None:
     group = parser.add_argument_group("output")
-    group.add_argument("--out", type=Path, metavar="FILE", help="write to FILE.csv or FILE.json (default: print)")
+    group.add_argument("--out", type=Path, metavar="FILE", help=f"write {out}")
     group.add_argument("--json", action="store_true", help="print JSON instead of CSV")
     if plot is not None:
         group.add_argument("--plot", type=Path, metavar="FILE", help=f"draw {plot} into FILE.png, .svg or .pdf")
@@ -322,7 +324,7 @@ def add_output(parser: argparse.ArgumentParser, plot: str | None) -> None:
 
 def check_output(options: argparse.Namespace) -> None:
     """Refuse names that could not be written at the end of a long computation."""
-    for name, endings in (("out", (".csv", ".json")), ("plot", plotting.FORMATS)):
+    for name, endings in (("out", getattr(options, "out_endings", (".csv", ".json"))), ("plot", plotting.FORMATS)):
         path = getattr(options, name, None)
         if path is None:
             continue
@@ -340,17 +342,26 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def emit(options: argparse.Namespace, table: Table) -> None:
+def _as_json(table: Table) -> str:
     rows = [{name: _plain(value) for name, value in row.items()} for row in table.rows()]
-    document = json.dumps({"metadata": table.metadata, "rows": rows}, indent=1, allow_nan=False)
+    return json.dumps({"metadata": table.metadata, "rows": rows}, indent=1, allow_nan=False)
+
+
+def print_table(options: argparse.Namespace, table: Table) -> None:
+    """Print a table as CSV, or as JSON if --json asks for it."""
+    if options.json:
+        print(_as_json(table))
+    else:
+        table.write(sys.stdout)
+
+
+def emit(options: argparse.Namespace, table: Table) -> None:
+    """Write a table to the file of --out, or print it."""
     if options.out is None:
-        if options.json:
-            print(document)
-        else:
-            table.write(sys.stdout)
+        print_table(options, table)
     elif options.out.suffix.lower() == ".json":
         with atomic_file(options.out) as file:
-            file.write(document + "\n")
+            file.write(_as_json(table) + "\n")
     else:
         table.to_csv(options.out)
 

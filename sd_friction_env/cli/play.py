@@ -12,7 +12,7 @@ from sd_friction_env.cli.options import (
     environment_of,
     progress_bar,
 )
-from sd_friction_env.pictures.rendering import checked_size
+from sd_friction_env.pictures.renderer import checked_size
 
 
 def _explore(options: argparse.Namespace) -> int:

@@ -42,7 +42,8 @@ class Display:
 
     def draw(self, state: EnvState, title: str) -> Any:
         """Draw a state; return an array (height, width, 3), uint8, in mode "rgb_array"."""
-        from sd_friction_env.pictures.rendering import Renderer, Scene
+        from sd_friction_env.pictures.renderer import Renderer
+        from sd_friction_env.pictures.scene import Scene
 
         if self._renderer is None:
             self._renderer = Renderer(self._mode, *self._size, fps=FRAMES_PER_SECOND)

@@ -22,7 +22,7 @@ from sd_friction_env.environments.options import (
 from sd_friction_env.environments.states import EnvState, check_state, read_state, write_state
 from sd_friction_env.environments.task import Task, rig_arguments, steps_before_last_quarter
 from sd_friction_env.physics.parameters import OscillatorParameters, plant_of
-from sd_friction_env.pictures.rendering import checked_size
+from sd_friction_env.pictures.renderer import checked_size
 
 RewardFunction = Callable[[Mapping[str, Any]], float]
 

@@ -165,8 +165,8 @@ def _classifier(parameters: OscillatorParameters) -> tuple[tuple[LimitCycle, ...
 
 def basin_grid(
     parameters: OscillatorParameters,
-    x_limits: tuple[float, float],
-    v_limits: tuple[float, float],
+    x_limits: tuple[float, float] = (-1.5, 1.5),
+    v_limits: tuple[float, float] = (-1.0, 1.0),
     shape: tuple[int, int] = (400, 400),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], Basins]:
     """Return x of shape (n,), v of shape (m,) and the basins of their grid, labels of shape (m, n).

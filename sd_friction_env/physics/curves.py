@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env.physics.orbits import LimitCycle, OrbitError, attractors, equilibria, limit_cycle
+from sd_friction_env.physics.orbits import (
+    LimitCycle,
+    OrbitError,
+    attractors,
+    critical_belt_speeds,
+    equilibria,
+    limit_cycle,
+)
 from sd_friction_env.physics.parameters import RANGES, STATE_LIMIT, OscillatorParameters, checked_number
 from sd_friction_env.physics.tables import Table
 
@@ -90,6 +97,26 @@ def amplitude_curve(
         if progress is not None:
             progress(done, len(speeds))
     return _table(rows, parameters)
+
+
+def refined_curve(
+    parameters: OscillatorParameters, belt_speeds: ArrayLike, *, x: float = 0.0, v: float | None = None
+) -> Table:
+    """Return :func:`amplitude_curve` with columns v_b0 and v_b1 and more points, in ascending order of belt speed.
+
+    The points are v_b0 and v_b1, each from both sides, so that the branches meet there, and 25 between them, where the
+    curve is steep; those outside the range of ``belt_speeds`` are left out. Arguments and errors are those of
+    ``amplitude_curve``.
+    """
+    speeds = checked_belt_speeds(belt_speeds)
+    v_b0, v_b1 = critical_belt_speeds(parameters)
+    end = v_b1 if np.isfinite(v_b1) else v_b0
+    edge = end - (end - v_b0) * np.linspace(0.0, 1.0, 25) ** 2
+    added = np.concatenate((edge - 1e-9, [v_b0 + 1e-9, v_b1 + 1e-9]))
+    added = added[(added > speeds.min()) & (added < speeds.max())]  # NaN, where there is none, is not
+    curve = amplitude_curve(parameters, np.unique(np.concatenate((speeds, added))), x=x, v=v)
+    ends = {name: np.full(curve.n_rows, value) for name, value in (("v_b0", v_b0), ("v_b1", v_b1))}
+    return Table(ends | dict(curve), curve.metadata)
 
 
 def attractor_curves(

@@ -88,6 +88,10 @@ class Trajectory:
     status: str
     parameters: OscillatorParameters
 
+    def __repr__(self) -> str:
+        samples = f"{len(self.t)} samples up to t = {self.t[-1]:.6g}"
+        return f"Trajectory({samples}, {len(self.events)} events, {self.stick_time:.6g} stuck, status {self.status!r})"
+
     def amplitude(self, since: float = 0.0) -> float:
         """Return half the distance between the extremes of the samples of x from time ``since`` on."""
         part = self.x[self.t >= since]

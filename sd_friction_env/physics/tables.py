@@ -1,5 +1,7 @@
 """Tidy tables: named columns of equal length, light enough for the base install."""
 
+import html
+import itertools
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -9,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.storage import LARGEST_ARCHIVE, atomic_file, read_text
+
+_SHOWN_ROWS = 10
 
 
 class Table(dict[str, NDArray[Any]]):
@@ -20,6 +24,20 @@ class Table(dict[str, NDArray[Any]]):
         lengths = {name: len(values) for name, values in self.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"columns must have one length, got {lengths}")
+
+    def __repr__(self) -> str:
+        return f"Table of {self.n_rows} rows: {', '.join(self)}"
+
+    def _repr_html_(self) -> str:
+        """Return the first rows as HTML, for notebooks."""
+        head = "".join(f"<th>{html.escape(name)}</th>" for name in self)
+        rows = [
+            "".join(f"<td>{html.escape(_short(value))}</td>" for value in row.values())
+            for row in itertools.islice(self.rows(), _SHOWN_ROWS)
+        ]
+        body = "".join(f"<tr>{row}</tr>" for row in rows)
+        rest = f"<p>{len(rows)} of {self.n_rows} rows</p>" if self.n_rows > len(rows) else ""
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{rest}"
 
     @property
     def n_rows(self) -> int:
@@ -86,6 +104,10 @@ class Table(dict[str, NDArray[Any]]):
             except ValueError:
                 columns[name] = np.array(values)
         return cls(columns, metadata)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _cell(value: Any) -> str:

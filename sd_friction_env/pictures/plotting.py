@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env.physics.basins import Basins
 from sd_friction_env.physics.forced import ForcedBasins
+from sd_friction_env.physics.orbits import LimitCycle
 from sd_friction_env.physics.simulation import Trajectory
 from sd_friction_env.physics.tables import Table
 from sd_friction_env.storage import atomic_file, checked_ending
@@ -18,24 +19,48 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours; lines differ in dash or weight too, so that grey prints tell them apart.
+# Okabe and Ito's colours, one meaning each: blue sticks, vermilion slips, green is controlled, grey is passive. The
+# others have no fixed meaning. Lines differ in dash or weight too, so that grey prints tell them apart.
 BLUE, VERMILION, GREEN, GREY, BLACK = "#0072B2", "#D55E00", "#009E73", "#8A8A8A", "#202020"
+SKY, ORANGE, PURPLE = "#56B4E9", "#E69F00", "#CC79A7"
 BRANCHES = {
     "stick-slip": {"color": BLUE, "linestyle": "-", "linewidth": 2.2, "label": r"stick-slip, $A_0$"},
     "pure-slip": {"color": VERMILION, "linestyle": (0, (4, 1.2)), "linewidth": 2.2, "label": r"pure slip, $A_1$"},
     "steady-slip": {"color": GREY, "linestyle": ":", "linewidth": 1.8, "label": "steady slip"},
-    "neutral": {"color": GREEN, "linestyle": "-.", "linewidth": 1.8, "label": "neutral, as started"},
+    "neutral": {"color": PURPLE, "linestyle": "-.", "linewidth": 1.8, "label": "neutral, as started"},
 }
-PAIR = ({"color": BLUE, "linewidth": 2.0}, {"color": VERMILION, "linewidth": 1.6, "linestyle": (0, (4, 1.2))})
+PAIR = ({"color": BLACK, "linewidth": 2.0}, {"color": ORANGE, "linewidth": 1.8, "linestyle": (0, (4, 1.2))})
 # A family of curves: colours of falling lightness, a marker each.
 FAMILY = (
-    {"color": "#56B4E9", "marker": "o"},
-    {"color": "#E69F00", "marker": "s"},
-    {"color": GREEN, "marker": "^"},
+    {"color": SKY, "marker": "o"},
+    {"color": ORANGE, "marker": "s"},
+    {"color": PURPLE, "marker": "^"},
     {"color": BLACK, "marker": "D"},
 )
-CONTROLLED = ({"marker": "o", "color": GREEN}, {"marker": "s", "color": VERMILION}, {"marker": "^", "color": BLACK})
-
+LINES = {"stick-slip": "-", "pure-slip": (0, (3, 1)), "steady-slip": (0, (1, 1.5))}  # of a family's members
+# Small and solid over large and hollow, so that neither hides the other.
+CONTROLLED = (
+    {"marker": "o", "markersize": 4.0, "color": GREEN, "zorder": 4},
+    {"marker": "s", "markersize": 8.5, "color": GREEN, "markerfacecolor": "none", "markeredgewidth": 1.5, "zorder": 3},
+    {"marker": "^", "markersize": 11.0, "color": GREEN, "markerfacecolor": "none", "zorder": 3},
+)
+WAYS = {"up": ORANGE, "down": BLACK}
+LABELS = {
+    "alpha": r"anchor height $\alpha$",
+    "g1": "weight $g_1$",
+    "beta": r"damping ratio $\beta$",
+    "mu_s": r"static friction $\mu_s$",
+    "mu_m": r"least kinetic friction $\mu_m$",
+    "v_m": "speed of least friction $v_m$",
+    "belt_speed": "belt speed $v_b$",
+    "mu_k": r"kinetic friction $\mu_k$",
+    "mu_v": r"viscous friction $\mu_v$",
+    "v_0": "decay speed of friction $v_0$",
+    "delta": r"friction decay $\delta$",
+    "kappa": r"cubic stiffness $\kappa$",
+    "force_amplitude": "force amplitude $f$",
+    "force_frequency": r"force frequency $\Omega$",
+}
 
 FORMATS = (".png", ".svg", ".pdf")
 
@@ -91,48 +116,60 @@ def save_figure(figure: "Figure", path: str | os.PathLike[str], dpi: int = 150) 
         figure.savefig(file, format=ending[1:], dpi=dpi, metadata={stamp: None})
 
 
+def label_of(name: str) -> str:
+    """Return the name of an axis for a parameter: its meaning and its symbol."""
+    return LABELS.get(name, name.replace("_", " "))
+
+
+def _symbol_of(name: str) -> str:
+    """Return a parameter's symbol, its name where it has none."""
+    return f"${LABELS[name].split('$')[1]}$" if name in LABELS else name
+
+
+def _shown(curve: Table, kind: str, column: str) -> NDArray[np.float64]:
+    """Return a column where the motion is of a kind, else NaN; stick-slip begins with the rest on a belt at rest."""
+    chosen = curve["kind"] == kind
+    if kind == "stick-slip":
+        chosen = chosen | ((curve["kind"] == "rest") & (curve["belt_speed"] == 0.0))
+    return np.where(chosen, curve[column], np.nan)
+
+
 @house_style()
 def draw_amplitude_curve(axis: "Axes", curve: Table, column: str = "amplitude") -> None:
     """Draw one curve over the belt speed, a line for each kind of motion."""
     for kind, style in BRANCHES.items():
-        shown = np.where(curve["kind"] == kind, curve[column], np.nan)
+        shown = _shown(curve, kind, column)
         if np.isfinite(shown).any():
             axis.plot(curve["belt_speed"], shown, **style)  # type: ignore[arg-type]
 
 
 @house_style()
 def draw_family_member(axis: "Axes", curve: Table, column: str, label: str, style: Mapping[str, str]) -> None:
-    """Draw one curve of several: solid in stick-slip, dashed in pure slip, with a few markers to tell it in grey."""
-    for kind, line in (("stick-slip", "-"), ("pure-slip", (0, (3, 1)))):
-        shown = np.where(curve["kind"] == kind, curve[column], np.nan)
-        every = {"markevery": (4, 16), "marker": style["marker"], "markersize": 4.5} if kind == "stick-slip" else {}
-        axis.plot(
-            curve["belt_speed"],
-            shown,
-            color=style["color"],
-            linestyle=line,
-            linewidth=1.8,
-            label=label if kind == "stick-slip" else None,
-            **every,  # type: ignore[arg-type]
-        )
+    """Draw one curve of several: solid in stick-slip, dashed in pure slip, dotted in steady slip, with a few markers
+    to tell it in grey."""
+    for kind, line in LINES.items():
+        first: dict[str, Any] = {"label": label, "markevery": (4, 16), "marker": style["marker"], "markersize": 4.5}
+        extra = first if kind == "stick-slip" else {}
+        shown = _shown(curve, kind, column)
+        axis.plot(curve["belt_speed"], shown, color=style["color"], linestyle=line, linewidth=1.8, **extra)
 
 
 @house_style()
 def mark_critical_speeds(axis: "Axes", v_b0: float, v_b1: float) -> None:
-    """Mark v_b0 and v_b1 with their values; the names stand to the left and right of the pair."""
-    marks = ((v_b0, "right", rf"$v_{{b0}} = {v_b0:.4f}$ "), (v_b1, "left", rf" $v_{{b1}} = {v_b1:.4f}$"))
+    """Mark v_b0 and v_b1; their values stand above the axes, to the left and right of the pair."""
+    marks = ((v_b0, "right", rf"$v_{{b0}} = {v_b0:.4f}$"), (v_b1, "left", rf"$v_{{b1}} = {v_b1:.4f}$"))
     for speed, side, label in marks:
         if np.isfinite(speed):
             axis.axvline(speed, color="0.45", linewidth=0.9, linestyle=(0, (6, 3)))
-            top = axis.get_ylim()[1]
-            axis.text(speed, 0.99 * top, label, rotation=90, va="top", ha=side, fontsize=8, color="0.3")
+            above = axis.get_xaxis_transform()
+            axis.text(speed, 1.01, label, transform=above, va="bottom", ha=side, fontsize=8, color="0.3")
 
 
 @house_style()
 def draw_controlled_points(axis: "Axes", series: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> None:
     """Lay closed-loop amplitudes over a passive curve: (belt speeds, amplitudes) by name."""
     for style, (name, (speeds, amplitudes)) in zip(CONTROLLED, series.items(), strict=False):
-        axis.plot(speeds, amplitudes, linestyle="none", markersize=5.5, markeredgecolor="white", label=name, **style)  # type: ignore[arg-type]
+        axis.plot(speeds, amplitudes, linestyle="none", label=name, **style)  # type: ignore[arg-type]
 
 
 @house_style()
@@ -150,15 +187,15 @@ def draw_before_and_after(histories: Mapping[str, Trajectory], switched_on: floa
         for axis, values, label in ((row[0], x, r"displacement $x$"), (row[1], v, r"velocity $\dot x$")):
             axis.axvspan(switched_on, t[-1], color="0.95", zorder=0)
             axis.plot(t[before], values[before], color=GREY, linewidth=1.4)
-            axis.plot(t[~before], values[~before], color=BLUE, linewidth=1.4)
+            axis.plot(t[~before], values[~before], color=GREEN, linewidth=1.4)
             axis.set_xlabel(r"time $\tau$")
             axis.set_ylabel(label)
             axis.margins(x=0)
         row[0].set_title(name, loc="left", fontsize=10)
-        row[1].plot(t, belt, color=VERMILION, linewidth=1.0, linestyle=(0, (4, 2)), label=r"belt $v_b$")
+        row[1].plot(t, belt, color=BLACK, linewidth=1.0, linestyle=(0, (4, 2)), label=r"belt $v_b$")
         row[1].legend(loc="lower right", fontsize=8, frameon=False)
         row[2].plot(x[before], v[before], color=GREY, linewidth=1.2, label="passive")
-        row[2].plot(x[~before], v[~before], color=BLUE, linewidth=1.2, label="controlled")
+        row[2].plot(x[~before], v[~before], color=GREEN, linewidth=1.2, label="controlled")
         row[2].plot(x[-1:], v[-1:], marker="o", color=BLACK, markersize=5, linestyle="none", label="end")
         row[2].set_xlabel(r"$x$")
         row[2].set_ylabel(r"$\dot x$")
@@ -171,7 +208,8 @@ def draw_amplitude_table(table: Table, members: Sequence[Mapping[str, Any]]) -> 
     """Draw the curves of a sweep: one by its branches, several as a family, attractors as points.
 
     Args:
-        table: as :func:`curves.amplitude_curve` makes it, with a column for each swept parameter.
+        table: of :func:`curves.refined_curve` (or :func:`curves.attractor_curves`), with a column for each swept
+            parameter.
         members: the swept parameters of each curve, by name.
     """
     figure, axes = new_figure(6.4, 4.4, 1, 1)
@@ -181,7 +219,7 @@ def draw_amplitude_table(table: Table, members: Sequence[Mapping[str, Any]]) -> 
         for name, value in member.items():
             chosen &= table[name] == value
         curve = Table({name: column[chosen] for name, column in table.items()})
-        label = ", ".join(f"{name} = {value}" for name, value in member.items())
+        label = ", ".join(f"{_symbol_of(name)} = {value}" for name, value in member.items())
         if "well" in table:
             for well, marker in (("left", "<"), ("right", ">"), ("only", "o"), ("both", "D")):
                 part = curve["well"] == well
@@ -191,11 +229,16 @@ def draw_amplitude_table(table: Table, members: Sequence[Mapping[str, Any]]) -> 
                     axis.plot(curve["belt_speed"][part], curve["amplitude"][part], label=name, **style)
         elif len(members) == 1:
             draw_amplitude_curve(axis, curve)
+            low, high = curve["belt_speed"].min(), curve["belt_speed"].max()
+            speeds = (curve["v_b0"][0], curve["v_b1"][0])
+            mark_critical_speeds(axis, *(speed if low <= speed <= high else np.nan for speed in speeds))
         else:
             draw_family_member(axis, curve, "amplitude", label, FAMILY[i % len(FAMILY)])
     axis.set_xlabel(r"belt speed $v_b$")
     axis.set_ylabel(r"amplitude $A$")
-    axis.set_ylim(bottom=0.0)
+    if len(members) > 1 and "well" not in table:
+        axis.set_title("solid: stick-slip; dashed: pure slip; dotted: steady slip", fontsize=8, loc="left")
+    axis.set_ylim(bottom=-0.02 * axis.get_ylim()[1])  # steady slip lies on zero
     if len(members) <= 12:
         axis.legend(fontsize=8, frameon=False)
     return figure
@@ -207,17 +250,37 @@ def draw_history(history: Trajectory) -> "Figure":
     figure, axes = new_figure(11.0, 3.2, 1, 3, width_ratios=(2.2, 2.2, 1.6))
     stuck = history.mode == 0
     for axis, values, label in ((axes[0, 0], history.x, "$x$"), (axes[0, 1], history.v, r"$\dot x$")):
-        axis.plot(history.t, values, color=BLUE, linewidth=1.4)
-        axis.plot(history.t, np.where(stuck, values, np.nan), color=VERMILION, linewidth=2.6, label="stick")
+        axis.plot(history.t, values, color=VERMILION, linewidth=1.4, label="slip")
+        axis.plot(history.t, np.where(stuck, values, np.nan), color=BLUE, linewidth=2.6, label="stick")
         axis.set_xlabel(r"time $\tau$")
         axis.set_ylabel(label)
         axis.margins(x=0)
-    axes[0, 2].plot(history.x, history.v, color=BLUE, linewidth=1.2)
-    axes[0, 2].plot(np.where(stuck, history.x, np.nan), history.v, color=VERMILION, linewidth=2.6)
-    axes[0, 2].set_xlabel("$x$")
-    axes[0, 2].set_ylabel(r"$\dot x$")
+    draw_portrait(axes[0, 2], history.x, history.v, stuck)
     axes[0, 0].legend(fontsize=8, frameon=False)
     return figure
+
+
+@house_style()
+def draw_portrait(
+    axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], stuck: NDArray[np.bool_], linewidth: float = 1.2
+) -> None:
+    """Draw a phase portrait, its stick phases marked."""
+    axis.plot(x, v, color=VERMILION, linewidth=linewidth, label="slip")
+    axis.plot(np.where(stuck, x, np.nan), v, color=BLUE, linewidth=2.6, label="stick")
+    axis.set_xlabel("$x$")
+    axis.set_ylabel(r"$\dot x$")
+
+
+def _draw_dots(axis: "Axes", x: Any, y: Any, size: float, color: str, label: str) -> None:
+    """Draw many points, and their name in the legend with a marker that is large enough to see."""
+    style: dict[str, Any] = {"linestyle": "none", "color": color, "markeredgewidth": 0.0}
+    axis.plot(x, y, marker=".", markersize=size, rasterized=True, **style)
+    axis.plot([], [], marker="o", markersize=max(size, 4.0), label=label, **style)
+
+
+def attractor_name(cycle: LimitCycle) -> str:
+    """Return an attractor's kind and place."""
+    return f"{cycle.kind} round x = {0.5 * (cycle.x_max + cycle.x_min):.2f}"
 
 
 @house_style()
@@ -231,7 +294,7 @@ def draw_basins(axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], fo
     from matplotlib.patches import Patch
 
     shades = ["#F5F5F5", "#BBBBBB", "#A6CEE3", "#FDD9B5", "#B9E3C6", "#DDC7E8", "#F7EFA5"]
-    names = ["undecided", "contact lost", *(f"{cycle.kind}" for cycle in found.attractors)]
+    names = ["undecided", "contact lost", *map(attractor_name, found.attractors)]
     axis.grid(visible=False)
     colours = [shades[i % len(shades)] for i in range(len(names))]
     norm = BoundaryNorm(np.arange(-2.5, len(found.attractors)), len(names))
@@ -253,33 +316,29 @@ def draw_basins(axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], fo
         if share > 0.0:
             text = f"{names[label + 2]}, {100.0 * share:.1f}%"
             patches.append(Patch(facecolor=colours[label + 2], edgecolor="0.6", label=text))
-    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=4, frameon=False)
+    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.17), ncols=4, frameon=False)
 
 
 @house_style()
 def draw_bifurcation(axis: "Axes", diagram: Table) -> None:
-    """Draw the section points of :func:`forced.bifurcation_diagram`, the way up under the way down."""
-    for way, color, size in (("up", BLACK, 1.6), ("down", VERMILION, 0.5)):
+    """Draw the section points of :func:`forced.bifurcation_diagram`: the way down in small points over the way up, so
+    that both show where they meet."""
+    values = np.unique(diagram["value"]).size
+    size = float(np.clip(600.0 / values, 2.2, 6.0))  # in points; a few values leave room for larger ones
+    for (way, color), share in zip(WAYS.items(), (1.0, 0.5), strict=True):
         part = diagram["direction"] == way
         if part.any():
-            style: dict[str, Any] = {
-                "linestyle": "none",
-                "marker": ".",
-                "markersize": size,
-                "markeredgewidth": 0.0,
-                "color": color,
-            }
-            axis.plot(diagram["value"][part], diagram["x"][part], rasterized=True, **style)
-            axis.plot([], [], linestyle="none", marker="o", markersize=2.0 + 2.0 * size, color=color, label=way)
+            _draw_dots(axis, diagram["value"][part], diagram["x"][part], share * size, color, way)
+    axis.set_xlabel(label_of(diagram.metadata["swept"]))
     axis.set_ylabel("$x$ on the section")
-    axis.legend(fontsize=8, frameon=False, loc="upper right")
+    axis.legend(fontsize=8, frameon=False, loc="best")
 
 
 @house_style()
 def draw_exponents(axis: "Axes", table: Table, floor: float = -0.25) -> None:
     """Draw the largest exponent over the value of a sweep, with two standard errors; below ``floor`` it is cut off."""
-    for way, color, width, line in (("up", BLACK, 1.6, "-"), ("down", VERMILION, 1.0, (0, (4, 1.2)))):
-        part = table["direction"] == way
+    for way, width, line in (("up", 2.4, "-"), ("down", 1.0, (0, (4, 1.2)))):
+        part, color = table["direction"] == way, WAYS[way]
         if part.any():
             exponent = np.maximum(table["exponent"][part], 2.0 * floor)  # minus infinity too
             spread = 2.0 * table["standard_error"][part]
@@ -294,16 +353,8 @@ def draw_exponents(axis: "Axes", table: Table, floor: float = -0.25) -> None:
 def draw_section(axis: "Axes", section: Table) -> None:
     """Draw a stroboscopic section, :func:`forced.poincare_section`, its stuck states apart."""
     stuck = section["mode"] == 0
-    for part, color, label in ((~stuck, BLUE, "slip"), (stuck, VERMILION, "stick")):
-        style: dict[str, Any] = {
-            "linestyle": "none",
-            "marker": ".",
-            "markersize": 2.2,
-            "markeredgewidth": 0.0,
-            "color": color,
-        }
-        axis.plot(section["x"][part], section["v"][part], rasterized=True, **style)
-        axis.plot([], [], linestyle="none", marker="o", markersize=4.0, color=color, label=label)
+    for part, color, label in ((~stuck, VERMILION, "slip"), (stuck, BLUE, "stick")):
+        _draw_dots(axis, section["x"][part], section["v"][part], 2.2, color, label)
     axis.set_xlabel("$x$")
     axis.set_ylabel(r"$\dot x$")
     axis.legend(fontsize=8, frameon=False)

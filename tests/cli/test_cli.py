@@ -10,14 +10,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sd_friction_env import Table, __version__, limit_cycle
+from sd_friction_env import (
+    Table,
+    __version__,
+    amplitude_curve,
+    basin_grid,
+    critical_belt_speeds,
+    limit_cycle,
+)
 from sd_friction_env.cli import doctor
 from sd_friction_env.cli.main import main
 from sd_friction_env.cli.options import numbers
 from sd_friction_env.control import pretrained
 from sd_friction_env.control.pretrained import pretrained_file
+from sd_friction_env.physics.curves import refined_curve
 from sd_friction_env.physics.forced import bifurcation_diagram, lyapunov_exponent, poincare_section
 from sd_friction_env.physics.parameters import OscillatorParameters
+from sd_friction_env.storage import load_arrays
 
 
 def test_the_published_command_writes_a_table_and_a_plot(tmp_path):
@@ -115,6 +124,7 @@ def test_a_forced_motion_is_seen_in_its_section_its_exponent_and_its_diagram(tmp
     wanted = bifurcation_diagram(parameters, *diagram, direction="both", cycles=20)
     assert np.array_equal(table["x"], wanted["x"])
     assert table["direction"].tolist() == wanted["direction"].tolist()
+    assert table["force_amplitude"].tolist() == wanted["value"].tolist()
     assert plot.read_bytes().startswith(b"\x89PNG")
     for bad, said in (
         (["mass", "1"], "name must be one of"),
@@ -308,3 +318,29 @@ def test_every_command_has_help_with_examples(capsys):
             main([name, "--help"])
         assert leaving.value.code == 0
         assert f"examples:\n  sd-friction {name}" in capsys.readouterr().out
+
+
+def test_basins_writes_the_label_of_each_start(tmp_path, capsys):
+    x, v, found = basin_grid(OscillatorParameters(alpha=0.2), shape=(6, 5))
+    arguments = ["basins", "--alpha", "0.2", "--shape", "6", "5", "--out"]
+    assert main([*arguments, str(tmp_path / "grid.npz")]) == 0
+    assert "stick-slip round x = " in capsys.readouterr().out
+    grid = load_arrays(tmp_path / "grid.npz", texts=("metadata",))
+    assert np.array_equal(grid["labels"], found.labels)
+    assert (grid["x"].tolist(), grid["v"].tolist()) == (x.tolist(), v.tolist())
+    assert main([*arguments, str(tmp_path / "grid.csv")]) == 0
+    table = Table.from_csv(tmp_path / "grid.csv")
+    assert table["label"].reshape(5, 6).tolist() == found.labels.tolist()
+    assert table["x"][:6].tolist() == x.tolist()
+    assert table["v"][::6].tolist() == v.tolist()
+
+
+def test_a_refined_curve_has_the_critical_speeds_from_both_sides():
+    plain = amplitude_curve(OscillatorParameters(), [0.2, 0.6])
+    curve = refined_curve(OscillatorParameters(), [0.2, 0.6])
+    v_b0, v_b1 = critical_belt_speeds(OscillatorParameters())
+    for speed, kinds in ((v_b0, ["stick-slip", "pure-slip"]), (v_b1, ["pure-slip", "steady-slip"])):
+        near = np.abs(curve["belt_speed"] - speed) < 2e-9
+        assert curve["kind"][near].tolist() == kinds
+    assert curve["amplitude"][[0, -1]].tolist() == plain["amplitude"].tolist()
+    assert refined_curve(OscillatorParameters(), [0.1, 0.2]).n_rows == 2

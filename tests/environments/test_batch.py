@@ -488,10 +488,10 @@ def test_pictures_of_some_environments_are_those_of_single_ones():
 
 def test_a_picture_shows_the_mode_that_the_step_told(monkeypatch):
     pytest.importorskip("pygame")
-    from sd_friction_env.pictures import rendering
+    from sd_friction_env.pictures import renderer
 
     shown = []
-    monkeypatch.setattr(rendering.Renderer, "draw", lambda self, scene: shown.append(scene))
+    monkeypatch.setattr(renderer.Renderer, "draw", lambda self, scene: shown.append(scene))
     envs = batch(num_envs=3, render_mode="rgb_array", render_envs=[1], force_limit=0.3, info_keys=("mode",))
     envs.reset(seed=0, options={"phase": 0.9})
     envs.render()

@@ -12,7 +12,7 @@ pytest.importorskip("matplotlib")
 import matplotlib
 import numpy as np
 
-from scripts import figure_3
+from scripts.figures import paper
 from sd_friction_env import OscillatorParameters, Table, amplitude_curve, load_pretrained, simulate
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import load_policy
@@ -62,7 +62,7 @@ def test_so_are_those_that_are_put_together_from_parts_and_those_of_the_scripts(
             plotting.draw_amplitude_curve(axes[0, 0], curve)
             plotting.mark_critical_speeds(axes[0, 0], 0.3, 0.4)
             plotting.save_figure(figure, tmp_path / "parts.png")
-            figure_3.draw(table, tmp_path / "figure_3.png", {"exact": {"agent": ([0.2], [0.0])}})
+            paper.draw_3(table, tmp_path / "figure_3.png", {"exact": {"agent": ([0.2], [0.0])}})
         return (tmp_path / "parts.png").read_bytes(), (tmp_path / "figure_3.png").read_bytes()
 
     ours = files({})

@@ -29,17 +29,17 @@ def test_the_demo_trains_compares_and_draws(tmp_path):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     table = Table.from_csv(out / "comparison.csv")
     assert table["controller"].tolist() == [
-        f"{task}: {name}" for task in ("force", "belt") for name in ("passive", "velocity feedback", "PPO")
+        f"{task}: {name}" for task in ("force", "belt") for name in ("passive", "linear state feedback, tuned", "PPO")
     ]
     assert table["score"][0] == 0.0
-    assert table["score"][1] > 0.98  # velocity feedback by force is near the optimum
+    assert table["score"][1] > 0.98  # linear feedback by force is near the optimum
     assert "suppressed" in run.stdout
     assert "steps/s" in run.stderr  # progress is shown
 
 
 @pytest.mark.parametrize("number", [2, 3, 4, 5])
 def test_a_figure_script_writes_its_table_and_its_picture(number, tmp_path):
-    script(f"figure_{number}.py", "--out", tmp_path)
+    script("figures", f"figure_{number}", "--out", tmp_path)
     table = Table.from_csv(tmp_path / f"figure_{number}.csv")
     assert table.n_rows > 100
     assert "kind" in table
@@ -50,7 +50,7 @@ def test_a_figure_script_writes_its_table_and_its_picture(number, tmp_path):
 
 @pytest.mark.parametrize("number", [2, 3, 4, 5])
 def test_the_committed_tables_are_what_the_scripts_compute_now(number, tmp_path):
-    script(f"figure_{number}.py", "--out", tmp_path)
+    script("figures", f"figure_{number}", "--out", tmp_path)
     now, kept = (Table.from_csv(folder / f"figure_{number}.csv") for folder in (tmp_path, ROOT / "figures"))
     assert list(now) == list(kept)
     for name in now:
@@ -63,7 +63,7 @@ def test_the_committed_tables_are_what_the_scripts_compute_now(number, tmp_path)
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
-    run = script("figure_3.py", "--out", blocked / "below", code=1)
+    run = script("figures", "figure_3", "--out", blocked / "below", code=1)
     assert len(run.stderr.splitlines()) == 1
     assert "cannot write into --out" in run.stderr
 

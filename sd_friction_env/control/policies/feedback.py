@@ -1,7 +1,7 @@
 """Classical feedback: linear, velocity, filtered, delayed and sliding-mode controllers with saturated actions."""
 
 from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -101,7 +101,7 @@ class Feedback:
     """
 
     _: KW_ONLY
-    readings: Readings
+    readings: Readings = field(repr=False)
 
     _ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}  # of the controller's numbers, by name
     _needs_velocity: ClassVar[bool] = False

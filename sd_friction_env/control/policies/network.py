@@ -86,6 +86,12 @@ class NetworkPolicy:
             raise ValueError(f"{inputs} inputs cannot be {self.frames} observations")
         object.__setattr__(self, "layers", layers)
 
+    def __repr__(self) -> str:
+        sizes = "-".join(str(size) for size in (self.layers[0][0].shape[0], *(len(bias) for _, bias in self.layers)))
+        window = f" of {self.frames} observations" if self.frames > 1 else ""
+        origin = " ".join(str(self.metadata[key]) for key in ("algorithm", "env_id") if key in self.metadata)
+        return f"NetworkPolicy({sizes}{window}, {self.activation}, {self.output}{', ' + origin if origin else ''})"
+
     @property
     def observation_size(self) -> int:
         """Entries of one observation."""

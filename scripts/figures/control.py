@@ -1,8 +1,5 @@
 """Optimal control over the phase plane: the cost still to come and the best action, for both actuators.
 
-    python scripts/figure_control.py                     writes control.csv (the paths) and .png into figures/
-    python scripts/figure_control.py --out elsewhere     into another folder
-
 Both come from the stored value functions (sd-friction optimum --policy). On belt they are those at the nominal belt
 speed; along the controlled path it varies. There an action of .5 already asks for all of the belt's acceleration.
 """
@@ -13,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scripts.figures import metadata, run, select, stack
+from scripts.figures.common import metadata, select, stack
 from sd_friction_env import OscillatorParameters, Table, limit_cycle
 from sd_friction_env.learning.optimal import TASKS, OptimalPolicy, Problem
 from sd_friction_env.pictures import plotting
@@ -63,10 +60,9 @@ def on_plane(policy: OptimalPolicy) -> tuple[NDArray[np.float64], NDArray[np.flo
 @plotting.house_style()
 def draw(table: Table, path: Path) -> None:
     """Draw a row for each actuator: the cost still to come on the left, the best action on the right."""
-    from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
+    from matplotlib.colors import BoundaryNorm
 
     figure, axes = plotting.new_figure(10.5, 7.6, len(TASKS), 2, sharex=True, sharey=True)
-    two_sided = LinearSegmentedColormap.from_list("actions", [plotting.VERMILION, "white", plotting.BLUE])
     for (left, right), (task, env_id) in zip(axes, TASKS.items(), strict=True):
         policy = OptimalPolicy.load(env_id)
         belt_speed = policy.parameters.belt_speed
@@ -78,7 +74,7 @@ def draw(table: Table, path: Path) -> None:
         plane = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         states = np.column_stack([plane, np.full(len(plane), belt_speed)])
         actions = policy.actions(states).reshape(len(rows), len(columns))
-        image = right.pcolormesh(columns, rows, actions, cmap=two_sided, vmin=-1.0, vmax=1.0, rasterized=True)
+        image = right.pcolormesh(columns, rows, actions, cmap="PuOr", vmin=-1.0, vmax=1.0, rasterized=True)
         figure.colorbar(image, ax=right, label="best action $a$", ticks=(-1, -0.5, 0, 0.5, 1))
         for axis in (left, right):
             draw_motions(axis, table, task, belt_speed)
@@ -107,7 +103,3 @@ def draw_motions(axis: "Axes", table: Table, task: str, belt_speed: float) -> No
         axis.plot(path["x"], path["v"], path_effects=edge, **style)  # type: ignore[arg-type]
     axis.plot(path["x"][0], path["v"][0], "o", color=plotting.GREEN, markeredgecolor="white", label="control begins")
     axis.set_ylim(VELOCITIES)
-
-
-if __name__ == "__main__":
-    raise SystemExit(run("control", __doc__, compute, draw))

@@ -1,14 +1,10 @@
-"""Stick-slip chaos of the forced SD belt, and its basins (our own parameters, exact geometry).
-
-python scripts/figure_chaos.py                     writes chaos.csv, chaos.png and forced_basins.png into figures/
-python scripts/figure_chaos.py --out elsewhere     into another folder
-"""
+"""Stick-slip chaos of the forced SD belt, and its basins (our own parameters, exact geometry)."""
 
 from pathlib import Path
 
 import numpy as np
 
-from scripts.figures import metadata, run
+from scripts.figures.common import metadata
 from sd_friction_env import OscillatorParameters, Table, simulate
 from sd_friction_env.physics.forced import (
     bifurcation_diagram,
@@ -60,10 +56,7 @@ def draw(table: Table, path: Path) -> None:
     history = simulate(PLANT, *ON_THE_CHAOS, t_end=230.0 * period, dt=0.01)
     late = history.t > 200.0 * period
     x, v, stuck = history.x[late], history.v[late], history.mode[late] == 0
-    portrait.plot(x, v, color=plotting.BLUE, linewidth=0.7, label="slip")
-    portrait.plot(np.where(stuck, x, np.nan), v, color=plotting.VERMILION, linewidth=2.6, label="stick")
-    portrait.set_xlabel("$x$")
-    portrait.set_ylabel(r"$\dot x$")
+    plotting.draw_portrait(portrait, x, v, stuck, linewidth=0.7)
     portrait.set_title("30 cycles of the force", loc="left", fontsize=10)
     portrait.legend(fontsize=8, frameon=False)
     plotting.save_figure(figure, path, dpi=110)
@@ -71,7 +64,3 @@ def draw(table: Table, path: Path) -> None:
     figure, axes = plotting.new_figure(7.0, 5.0, 1, 1)
     plotting.draw_forced_basins(axes[0, 0], forced_basins(PLANT, *LIMITS, SHAPE, cycles=150))
     plotting.save_figure(figure, path.with_name("forced_basins.png"))
-
-
-if __name__ == "__main__":
-    raise SystemExit(run("chaos", __doc__, compute, draw))

@@ -1,12 +1,8 @@
-"""Basins of attraction of two oscillators with two attractors each, exact geometry.
-
-python scripts/figure_basins.py                     writes figures/basins.csv (the shares) and figures/basins.png
-python scripts/figure_basins.py --out elsewhere     into another folder
-"""
+"""Basins of attraction of two oscillators with two attractors each, exact geometry."""
 
 from pathlib import Path
 
-from scripts.figures import metadata, run
+from scripts.figures.common import metadata
 from sd_friction_env import OscillatorParameters, Table, basin_grid
 from sd_friction_env.pictures import plotting
 
@@ -36,7 +32,3 @@ def draw(table: Table, path: Path) -> None:
         plotting.draw_basins(axis, *basin_grid(plant, *LIMITS, SHAPE))
         axis.set_title(rf"$\alpha = {plant.alpha:g}$, $v_b = {plant.belt_speed:g}$", loc="right", fontsize=10)
     plotting.save_figure(figure, path)
-
-
-if __name__ == "__main__":
-    raise SystemExit(run("basins", __doc__, compute, draw))

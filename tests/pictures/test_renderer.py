@@ -13,7 +13,8 @@ import time
 import numpy as np
 import pytest
 
-from sd_friction_env.pictures.rendering import Renderer, Scene
+from sd_friction_env.pictures.renderer import Renderer
+from sd_friction_env.pictures.scene import Scene
 
 if importlib.util.find_spec("pygame") is None:
     pytest.skip("needs pygame-ce", allow_module_level=True)
@@ -69,7 +70,7 @@ def in_a_process(code, **environment):
 
 
 SCENE_CODE = (
-    "import os, sys; from sd_friction_env.pictures.rendering import Renderer, Scene;"
+    "import os, sys; from sd_friction_env.pictures.renderer import Renderer, Scene;"
     "scene = Scene(time=0.0, x=0.6, v=0.2, v_belt=0.2, mode=0, belt_travel=0.0, force=0.0, force_limit=0.05,"
     " belt_speed_nominal=0.2, belt_speed_limits=(0.2, 0.2), alpha=0.8, geometry='exact', stick_interval=None,"
     " amplitude=float('nan'), stick_fraction=0.0);"
@@ -103,7 +104,7 @@ def test_no_display_is_touched_and_nothing_is_printed():
 
 
 def test_importing_the_module_loads_no_pygame():
-    in_a_process("import sys, sd_friction_env.pictures.rendering; assert 'pygame' not in sys.modules")
+    in_a_process("import sys, sd_friction_env.pictures.renderer; assert 'pygame' not in sys.modules")
 
 
 def test_the_mass_moves_to_scale_and_by_less_than_a_pixel_too():

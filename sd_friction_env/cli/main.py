@@ -621,7 +621,7 @@ def _bifurcation(options: argparse.Namespace) -> int:
 
 
 def _explore(options: argparse.Namespace) -> int:
-    from sd_friction_env.explorer import page as explorer
+    from sd_friction_env.explorer import server as explorer
 
     if not 0 <= options.port <= 65535:
         raise UsageError(f"--port must be in [0, 65535], got {options.port}")

@@ -16,7 +16,7 @@ from sd_friction_env.pictures.renderer import checked_size
 
 
 def _explore(options: argparse.Namespace) -> int:
-    from sd_friction_env.explorer import page as explorer
+    from sd_friction_env.explorer import server as explorer
 
     if not 0 <= options.port <= 65535:
         raise UsageError(f"--port must be in [0, 65535], got {options.port}")

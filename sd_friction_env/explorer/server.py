@@ -1,15 +1,18 @@
 """The explorer's server: Bokeh's, for requests to the names it was started for alone, and for so many pages at a time.
 
+It streams to the page over one socket and loads nothing from elsewhere.
+
 A page of another site can make a name of its own lead to this machine (DNS rebinding) and would then be of one origin
 with the explorer; its requests carry that name in Host. So every request is checked, before anything else sees it.
-Imports Bokeh: :func:`page.serve` says what to install.
 """
 
 import contextlib
 import re
 import socket
+import time
 import weakref
-from collections.abc import Iterable
+import webbrowser
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from bokeh.application import Application
@@ -22,8 +25,13 @@ from tornado.httputil import HTTPServerRequest
 from tornado.ioloop import IOLoop
 from tornado.web import HTTPError, RequestHandler
 
-from sd_friction_env.explorer.page import SESSIONS, Page
+from sd_friction_env.explorer.model import PlantPicture, passive_curve
+from sd_friction_env.explorer.page import Page
+from sd_friction_env.physics.parameters import OscillatorParameters
 
+HOST = "127.0.0.1"
+PORT = 5006
+SESSIONS, MOST_SESSIONS = 8, 1000  # pages at a time, unless said otherwise, and at most
 EVERYWHERE = "0.0.0.0"
 _NAME = re.compile(r"([a-z0-9]([a-z0-9._-]*[a-z0-9])?|\[[0-9a-f:.]+\])(?P<port>:[0-9]{1,5})?", re.IGNORECASE)
 _LEFT = 3_000  # milliseconds without a connection, after which a page gives way to another
@@ -144,7 +152,7 @@ def make_server(host: str, port: int, allowed: Iterable[str] = (), sessions: int
     """Return the explorer's server, which listens and answers once its loop runs, and its address.
 
     Args:
-        host, port, allowed, sessions: as of :func:`page.serve`.
+        host, port, allowed, sessions: as of :func:`serve`.
 
     Raises:
         OSError: if it cannot listen there. ValueError: if a name is none.
@@ -159,3 +167,41 @@ def make_server(host: str, port: int, allowed: Iterable[str] = (), sessions: int
     http.add_sockets([listening])
     server = BaseServer(IOLoop.current(), application, http)
     return server, f"http://{'localhost' if host == EVERYWHERE else host}:{port}/"
+
+
+def serve(
+    host: str = HOST,
+    port: int = PORT,
+    *,
+    allowed: Iterable[str] = (),
+    sessions: int = SESSIONS,
+    browser: bool = True,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Offer the explorer until interrupted.
+
+    Args:
+        host: address to listen at; others than this machine can come only if it is not a loopback address.
+        port: 0: any that is free. allowed: further names that a request may be for, see
+            :func:`served_hosts`. sessions: pages at a time, at least 1.
+        browser: open one. say: receives the page's address.
+
+    Raises:
+        OSError: if the port is taken. ValueError: if a name is none.
+    """
+    server, address = make_server(host, port, allowed, sessions)
+    # Compiled before the first page asks for it.
+    PlantPicture.of(OscillatorParameters())
+    begun = time.perf_counter()
+    passive_curve(OscillatorParameters())
+    took = time.perf_counter() - begun
+    server.start()
+    say(f"The explorer is at {address} (a curve takes {1e3 * took:.0f} ms); Ctrl-C ends it.")
+    if browser:
+        server.io_loop.add_callback(webbrowser.open, address)
+    try:
+        server.io_loop.start()
+    except KeyboardInterrupt:
+        say("")
+    finally:
+        server.stop()

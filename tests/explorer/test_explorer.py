@@ -19,8 +19,9 @@ from bokeh.events import ButtonClick
 from scripts import explorer_latency
 from sd_friction_env import OscillatorParameters, amplitude_curve, limit_cycle, load_pretrained
 from sd_friction_env.cli.main import main
-from sd_friction_env.explorer import page as explorer
-from sd_friction_env.explorer.page import (
+from sd_friction_env.explorer import model
+from sd_friction_env.explorer import page as page_module
+from sd_friction_env.explorer.model import (
     AGENT,
     FEEDBACK,
     HAND,
@@ -28,12 +29,13 @@ from sd_friction_env.explorer.page import (
     ROBUST,
     Latest,
     Live,
-    Page,
+    PlantPicture,
     basin_picture,
     controllers,
     passive_curve,
     passive_cycle,
 )
+from sd_friction_env.explorer.page import Page
 from sd_friction_env.explorer.server import make_server, served_hosts
 
 
@@ -69,7 +71,7 @@ def test_what_runs_is_the_environment_under_the_agent():
     live.choose_controller(AGENT)
     env = gym.make("SDFriction/BeltSpeed-v0")
     agent = load_pretrained("SDFriction/BeltSpeed-v0")
-    x, v = live.rider.info["x"], live.rider.info["v"]
+    x, v = live.loop.info["x"], live.loop.info["v"]
     observation, _ = env.reset(seed=0, options={"x": x, "v": v})
     rows = live.advance(50)
     for t in range(50):
@@ -85,11 +87,11 @@ def test_what_runs_is_the_environment_under_the_agent():
 def test_controllers_are_switched_while_it_runs_and_compared_from_there(task):
     live = Live(task)
     live.advance(100)
-    before = (live.rider.info["x"], live.rider.info["v"])
+    before = (live.loop.info["x"], live.loop.info["v"])
     assert "optimum" in controllers()
     for controller in controllers():
         live.choose_controller(controller)
-        assert (live.rider.info["x"], live.rider.info["v"]) == before  # not moved by the switch
+        assert (live.loop.info["x"], live.loop.info["v"]) == before  # not moved by the switch
         assert live.steps == 0
     assert live.missing == {}
     live.restart()
@@ -106,7 +108,7 @@ def test_controllers_are_switched_while_it_runs_and_compared_from_there(task):
         rows = live.advance(100)
         passive = limit_cycle(OscillatorParameters()).amplitude
         assert (0.5 * np.ptp(rows["x"]) < 0.05 * passive) == good, controller
-        assert (live.share() > 0.9) == good, controller
+        assert (live.score() > 0.9) == good, controller
 
 
 def test_the_hand_drives_the_mass_and_is_compared_with_the_agent():
@@ -118,17 +120,17 @@ def test_the_hand_drives_the_mass_and_is_compared_with_the_agent():
     assert live.advance(3)["action"] == [-1.0] * 3
     live.restart()
     live.advance(300)
-    assert live.share() < 0.3  # a push that never changes does not help
+    assert live.score() < 0.3  # a push that never changes does not help
 
 
 def test_a_changed_plant_is_the_plant_that_is_shown():
     live = Live("belt")
     live.advance(20)
-    before = live.rider.info["x"]
+    before = live.loop.info["x"]
     live.change(alpha=0.7, belt_speed=0.3)
     plant = OscillatorParameters(alpha=0.7, belt_speed=0.3)
-    assert live.rider.env.parameters == plant
-    assert live.rider.info["x"] == before
+    assert live.loop.env.parameters == plant
+    assert live.loop.info["x"] == before
     cycle = passive_cycle(live.parameters)
     assert cycle is not None
     assert cycle.amplitude == limit_cycle(plant).amplitude
@@ -154,23 +156,23 @@ def test_basins_tell_where_starts_end():
 
 def test_a_mass_that_loses_contact_is_put_back():
     live = Live("force", OscillatorParameters(geometry="cubic", alpha=0.9))
-    live.rider.start({"parameters": {"geometry": "cubic", "alpha": 0.9}, "x": 9.0, "v": 0.0})
+    live.loop.start({"parameters": {"geometry": "cubic", "alpha": 0.9}, "x": 9.0, "v": 0.0})
     rows = live.advance(50)
     assert rows["t"] == []  # what came before is of the past
-    assert abs(live.rider.info["x"]) < 3.0
-    live.rider.info |= {"x": 11.0}  # on its way out: a changed plant must not start there
+    assert abs(live.loop.info["x"]) < 3.0
+    live.loop.info |= {"x": 11.0}  # on its way out: a changed plant must not start there
     live.change(beta=0.06)
-    assert live.parameters.beta == live.rider.env.parameters.beta == 0.06
+    assert live.parameters.beta == live.loop.env.parameters.beta == 0.06
 
 
 def test_an_agent_that_is_not_there_is_told(monkeypatch):
     def none(env_id):
         raise ValueError("none here")
 
-    monkeypatch.setattr(explorer, "load_pretrained", none)
+    monkeypatch.setattr(model, "load_pretrained", none)
     live = Live("force")
     live.choose_controller(AGENT)
-    assert live.missing[AGENT] == "trained agent is not there: none here"
+    assert live.missing[AGENT] == "trained agent is not available: none here"
     assert live.advance(5)["action"] == [0.0] * 5
 
 
@@ -183,91 +185,95 @@ def test_the_page_follows_its_widgets():
     document = Document()
     page = Page(document)
     page.tick()
-    before = page.curve.data["amplitude"].copy()
-    page.sliders["alpha"].value = 0.6
+    before = page.drawing.curve.data["amplitude"].copy()
+    page.controls.plant["alpha"].value = 0.6
     follow(page)
-    assert not np.array_equal(before, page.curve.data["amplitude"])
+    assert not np.array_equal(before, page.drawing.curve.data["amplitude"])
     assert page.live.parameters.alpha == 0.6
-    page.sliders["mu_m"].value = 0.3  # above mu_s: refused in words, and all goes on
+    page.controls.plant["mu_m"].value = 0.3  # above mu_s: refused in words, and all goes on
     follow(page)
-    assert "mu_m" in page.message.text
+    assert "mu_m" in page.controls.message.text
     assert page.live.parameters.mu_m == 0.05
-    page.sliders["mu_s"].value = 0.4  # now it fits
+    page.controls.plant["mu_s"].value = 0.4  # now it fits
     follow(page)
-    assert page.message.text == ""
+    assert page.controls.message.text == ""
     assert (page.live.parameters.mu_m, page.live.parameters.mu_s) == (0.3, 0.4)
-    page.sliders["mu_m"].value, page.sliders["mu_s"].value = 0.05, 0.2
-    page.geometry.value = "cubic"
+    page.controls.plant["mu_m"].value, page.controls.plant["mu_s"].value = 0.05, 0.2
+    page.controls.plant["geometry"].value = "cubic"
     follow(page)
     assert page.live.parameters.geometry == "cubic"
-    page._nominal()
+    click(page, "nominal")
     follow(page)
     assert page.live.parameters == OscillatorParameters()
-    assert page.sliders["alpha"].value == 0.8
+    assert page.controls.plant["alpha"].value == 0.8
     click(page, "basins button")
     follow(page)
-    assert "of the starts" in page.message.text
-    page._take_over(1.0)
-    assert page.controller.value == HAND
+    assert "of the starts" in page.controls.message.text
+    click(page, "hand 1")
     page.tick()
-    assert page.path.data["action"][-1] == 1.0
-    page.hand.value = -0.5
+    assert page.controls.controller.value == HAND
     page.tick()
-    assert page.path.data["action"][-1] == -0.5
-    page.controller.value = OFF
+    assert page.drawing.path.data["action"][-1] == 1.0
+    page.controls.hand.value = -0.5
     page.tick()
-    assert page.path.data["action"][-1] == 0.0
-    page.hand.value = 0.25  # who moves the hand takes over
+    assert page.drawing.path.data["action"][-1] == -0.5
+    page.controls.controller.value = OFF
     page.tick()
-    assert (page.controller.value, page.path.data["action"][-1]) == (HAND, 0.25)
-    page.task.active = 0
+    assert page.drawing.path.data["action"][-1] == 0.0
+    page.controls.hand.value = 0.25  # who moves the hand takes over
+    page.tick()
+    assert (page.controls.controller.value, page.drawing.path.data["action"][-1]) == (HAND, 0.25)
+    page.controls.task.active = 0
     page.tick()
     assert page.live.task == "force"
-    assert len(page.path.data["t"]) > 0
+    assert len(page.drawing.path.data["t"]) > 0
 
 
 def test_the_page_goes_on_when_an_episode_ends(monkeypatch):
-    monkeypatch.setattr(explorer, "_LONGEST", 8)
+    monkeypatch.setattr(model, "_LONGEST", 8)
     page = Page(Document())
     for _ in range(12):
         page.tick()
-        assert (np.diff(page.path.data["t"]) > 0.0).all()
-        assert len(page.path.data["t"]) <= 8
-    assert np.isfinite(page.point.data["amplitude"]).all()
+        assert (np.diff(page.drawing.path.data["t"]) > 0.0).all()
+        assert len(page.drawing.path.data["t"]) <= 8
+    assert np.isfinite(page.drawing.point.data["amplitude"]).all()
 
 
 def test_a_page_without_a_cycle_shows_no_nan():
     page = Page(Document())
-    page.sliders["belt_speed"].value = 0.6
+    page.controls.plant["belt_speed"].value = 0.6
     follow(page)
     for _ in range(60):
         page.tick()
-    assert "nan" not in page.readout.text
+    assert "nan" not in page.drawing.readout.text
 
 
-def test_another_friction_law_and_excitation_are_shown_and_the_curve_is_of_the_plant_without():
+def test_another_friction_law_and_excitation_are_shown_and_the_curve_is_of_the_plant_without(monkeypatch):
     page = Page(Document())
-    before = page.curve.data["amplitude"].copy()
+    before = page.drawing.curve.data["amplitude"].copy()
     page.plant_work.executor = ByHand()
-    page.friction.value = "hyperbolic"
+    monkeypatch.setattr(page_module, "_ANNOUNCED", 0.0)
+    monkeypatch.setattr(page_module, "is_loaded", lambda plant: plant.friction == "stribeck")
+    page.controls.plant["friction"].value = "hyperbolic"
     for _ in range(20):
         page.tick()  # all goes on meanwhile
-    assert "compiled" in page.message.text
+    assert page.live.loop.env.parameters.friction == "stribeck"
+    assert "Compiling (exact spring, hyperbolic friction): about" in page.controls.message.text
     assert len(page.plant_work.executor.submitted) == 1
-    assert np.array_equal(before, page.curve.data["amplitude"])
+    assert np.array_equal(before, page.drawing.curve.data["amplitude"])
     page.plant_work.executor.finish()
     page.tick()
-    assert page.message.text == ""
-    assert page.live.rider.env.parameters.friction == "hyperbolic"
+    assert page.controls.message.text == ""
+    assert page.live.loop.env.parameters.friction == "hyperbolic"
     plant = OscillatorParameters(friction="hyperbolic")
-    assert np.array_equal(
-        page.curve.data["amplitude"], amplitude_curve(plant, page.curve.data["belt_speed"])["amplitude"], equal_nan=True
-    )
-    page.sliders["force_amplitude"].value = 0.2
-    page.sliders["ripple_amplitude"].value = 0.05
+    curve = page.drawing.curve.data
+    amplitudes = amplitude_curve(plant, curve["belt_speed"])["amplitude"]
+    assert np.array_equal(curve["amplitude"], amplitudes, equal_nan=True)
+    page.controls.plant["force_amplitude"].value = 0.2
+    page.controls.plant["ripple_amplitude"].value = 0.05
     page.plant_work.executor = futures.ThreadPoolExecutor(1)
     follow(page)
-    assert page.live.rider.env.parameters.excited
+    assert page.live.loop.env.parameters.excited
     cycle = passive_cycle(page.live.parameters)
     assert cycle is not None
     assert cycle.amplitude == limit_cycle(plant).amplitude
@@ -287,7 +293,7 @@ def test_a_plugin_that_fails_is_told_and_forgotten(monkeypatch):
         def load(self):
             raise KeyError("anything")
 
-    monkeypatch.setattr(explorer, "plugins", Failing)
+    monkeypatch.setattr(model, "plugins", Failing)
     live = Live("force")
     live.choose_controller("broken")
     assert "anything" in live.missing["broken"]
@@ -296,18 +302,64 @@ def test_a_plugin_that_fails_is_told_and_forgotten(monkeypatch):
     assert AGENT not in live.missing
 
 
+def test_the_state_is_named_by_word_shape_and_colour():
+    live = Live("belt")
+    passive = limit_cycle(OscillatorParameters()).amplitude
+    seen = []
+    for controller, intervals in ((OFF, 150), (AGENT, 600)):
+        live.choose_controller(controller)
+        for _ in range(intervals):
+            live.advance(1)
+            seen.append(live.regime(passive))
+    assert [sign for i, sign in enumerate(seen) if sign not in seen[:i]][:2] == [model.MEASURED, model.STICK_SLIP]
+    assert seen[-1] == model.AT_REST
+    assert live.mode == model.SLIPS  # which is no alarm
+    live.loop.info["stick_fraction"] = 1.0
+    assert live.mode == model.STICKS
+    signs = (model.STICK_SLIP, model.REDUCED, model.AT_REST)
+    assert all(len({getattr(sign, part) for sign in signs}) == 3 for part in ("words", "symbol", "marker", "color"))
+
+
+def test_only_sliders_that_the_chosen_laws_use_are_shown():
+    page = Page(Document())
+
+    def shown():
+        return {name for name, widget in page.controls.plant.items() if widget.visible}
+
+    assert {"alpha", "mu_m", "g1", "ripple_frequency"} <= shown()
+    assert not {"kappa", "mu_k", "delta"} & shown()
+    page.controls.plant["geometry"].value = "duffing"
+    page.controls.plant["friction"].value = "coulomb"
+    page.tick()
+    assert {"kappa", "linear_stiffness", "mu_k", "mu_s"} <= shown()
+    assert not {"alpha", "mu_m", "v_m"} & shown()
+    titles = [widget.title for widget in page.controls.plant.values()]
+    assert len(set(titles)) == len(titles)
+
+
+def test_new_laws_are_compiled_by_another_process_once(monkeypatch):
+    commands = []
+    monkeypatch.setattr(model.subprocess, "run", lambda command, **options: commands.append(command))
+    monkeypatch.setattr(model, "_loaded", set())
+    for alpha in (0.5, 0.6):
+        PlantPicture.after_compilation(OscillatorParameters(alpha=alpha))
+    assert [command[1:3] for command in commands] == [["-m", "sd_friction_env.explorer.model"]]
+    assert OscillatorParameters(**json.loads(commands[0][3])) == OscillatorParameters(alpha=0.5)
+
+
 def test_the_amplitude_is_of_whole_cycles():
     page = Page(Document())
     passive = limit_cycle(OscillatorParameters()).amplitude
     shown = []
     for _ in range(60):
         page.tick()
-        shown += list(page.point.data["amplitude"])
+        shown += list(page.drawing.point.data["amplitude"])
     assert len(shown) > 20
     assert shown == pytest.approx([passive] * len(shown), rel=0.01)
     click(page, "restart")
-    page.tick()
-    assert len(page.point.data["amplitude"]) == 0  # a few points are no cycle, however close together
+    for _ in range(4):
+        page.tick()
+    assert len(page.drawing.point.data["amplitude"]) == 0  # a few points are no cycle, however close together
 
 
 # Of many requests the latest counts -----------------------------------------------------------------------------------
@@ -317,11 +369,11 @@ def test_of_many_moves_of_a_slider_the_last_one_counts():
     page = Page(Document())
     by_hand = page.plant_work.executor = ByHand()
     for value in np.linspace(0.3, 0.7, 400):
-        page.sliders["alpha"].value = value
+        page.controls.plant["alpha"].value = value
     page.tick()
     assert len(by_hand.submitted) == 1
     for value in np.linspace(0.7, 0.5, 400):  # while that is computed
-        page.sliders["alpha"].value = value
+        page.controls.plant["alpha"].value = value
         page.tick()
     assert len(by_hand.submitted) == 1
     by_hand.finish()
@@ -342,25 +394,25 @@ def test_many_clicks_are_one_piece_of_work_and_a_changed_plant_forgets_it():
         click(page, "basins button")
         page.tick()
     assert len(by_hand.submitted) == 1
-    page.sliders["alpha"].value = 0.2
+    page.controls.plant["alpha"].value = 0.2
     follow_plant = page.plant_work
     page.tick()
     futures.wait([follow_plant.running])
     by_hand.finish()
     page.tick()
     assert page.live.parameters.alpha == 0.2
-    assert len(page.basins.data["image"]) == 0  # they were of another plant
+    assert len(page.drawing.basins.data["image"]) == 0  # they were of another plant
     assert len(by_hand.submitted) == 2  # the last click's, of the plant as it was
     by_hand.finish()
     page.tick()
-    assert len(page.basins.data["image"]) == 0
+    assert len(page.drawing.basins.data["image"]) == 0
     click(page, "basins button")
     page.tick()
     by_hand.finish()
     page.tick()
     image, words = basin_picture(OscillatorParameters(alpha=0.2))
-    assert np.array_equal(page.basins.data["image"][0], image, equal_nan=True)
-    assert page.message.text == words
+    assert np.array_equal(page.drawing.basins.data["image"][0], image, equal_nan=True)
+    assert page.controls.message.text == words
 
 
 def test_clicks_and_switches_between_two_frames_are_done_once(monkeypatch):
@@ -370,8 +422,8 @@ def test_clicks_and_switches_between_two_frames_are_done_once(monkeypatch):
         real = getattr(page.live, name)
         monkeypatch.setattr(page.live, name, lambda *a, real=real, name=name, **k: (done.append(name), real(*a, **k)))
     for i in range(101):
-        page.controller.value = (FEEDBACK, AGENT)[i % 2]
-        page.task.active = (1, 0)[i % 2]
+        page.controls.controller.value = (FEEDBACK, AGENT)[i % 2]
+        page.controls.task.active = (1, 0)[i % 2]
         click(page, "restart")
     page.tick()
     assert done.count("choose_controller") == 1
@@ -383,25 +435,25 @@ def test_clicks_and_switches_between_two_frames_are_done_once(monkeypatch):
 def test_a_page_whose_browser_has_gone_stops_its_work():
     page = Page(Document())
     by_hand = page.plant_work.executor = page.basin_work.executor = ByHand()
-    page.sliders["alpha"].value = 0.5
+    page.controls.plant["alpha"].value = 0.5
     click(page, "basins button")
     page.tick()
-    page.sliders["alpha"].value = 0.6
+    page.controls.plant["alpha"].value = 0.6
     page.tick()
     assert len(by_hand.submitted) == 2
     for callback in page.document.session_destroyed_callbacks:
         callback(None)
     assert by_hand.is_shut
-    steps, curve = page.live.steps, page.curve.data
+    steps, curve = page.live.steps, page.drawing.curve.data
     by_hand.finish()
     page.tick()
     assert len(by_hand.submitted) == 2
     assert page.live.steps == steps
-    assert page.curve.data is curve
+    assert page.drawing.curve.data is curve
 
 
 def test_a_page_that_nobody_touches_ends(monkeypatch):
-    monkeypatch.setattr(explorer, "_IDLE_TICKS", 10)
+    monkeypatch.setattr(page_module, "_IDLE_TICKS", 10)
     ended = []
     page = Page(Document(), on_idle=lambda: ended.append(True))
     for i in range(30):
@@ -409,38 +461,38 @@ def test_a_page_that_nobody_touches_ends(monkeypatch):
         if i % 5 == 4:
             click(page, "restart")
     assert not page.ended
-    page.sliders["alpha"].value = 0.5
+    page.controls.plant["alpha"].value = 0.5
     while not page.ended:
         page.tick()
     assert page.ticks < 60
     assert ended == []  # the message first
     page.tick()
     assert ended == [True]
-    assert "reload" in page.message.text
+    assert "reload" in page.controls.message.text
 
 
 def test_a_widget_set_to_nonsense_is_refused_in_words_and_all_goes_on():
     page = Page(Document())
     for change in (
-        lambda: setattr(page.hand, "value", float("nan")),
-        lambda: setattr(page.friction, "value", "<script>"),
-        lambda: setattr(page.sliders["alpha"], "value", -7.0),
-        lambda: setattr(page.task, "active", None),
-        lambda: setattr(page.controller, "value", "nobody"),
+        lambda: setattr(page.controls.hand, "value", float("nan")),
+        lambda: setattr(page.controls.plant["friction"], "value", "<script>"),
+        lambda: setattr(page.controls.plant["alpha"], "value", -7.0),
+        lambda: setattr(page.controls.task, "active", None),
+        lambda: setattr(page.controls.controller, "value", "nobody"),
     ):
         change()
         steps = page.live.steps
         follow(page)
-        assert "<script>" not in page.message.text
+        assert "<script>" not in page.controls.message.text
         follow(page)
-        assert np.isfinite(page.live.rider.info["x"])
+        assert np.isfinite(page.live.loop.info["x"])
     assert page.live.parameters == OscillatorParameters()
     assert page.live.steps > steps
 
 
 def test_latest_runs_one_and_keeps_one():
     shown = []
-    work = Latest(lambda future: shown.append(future.result()), ByHand())
+    work = Latest(lambda future: shown.append(future.result()), lambda: None, ByHand())
     for i in range(5):
         work.ask(lambda i=i: i)
         work.poll()
@@ -599,11 +651,11 @@ def test_a_page_that_nobody_touches_is_hung_up(monkeypatch):
         _, body = await request(port, f"Host: localhost:{port}", path="/")
         opened = await connect(port, token_in(body))
         (page,) = server._tornado._pages
-        page.idle_ticks = explorer._IDLE_TICKS
+        page.idle_ticks = page_module._IDLE_TICKS
         while await opened.read_message() is not None:
             pass
         assert page.ended
-        assert "Ended" in page.message.text
+        assert "Ended" in page.controls.message.text
         assert opened.close_reason == "idle"
         opened.close()
         while any(session.connection_count for session in server.get_sessions("/")):
@@ -619,7 +671,7 @@ def test_400_slider_events_over_the_socket_are_two_pieces_of_work_at_most():
         assert "ACK" in await opened.read_message()
         (page,) = server._tornado._pages
         by_hand = page.plant_work.executor = ByHand()
-        slider = page.sliders["alpha"]
+        slider = page.controls.plant["alpha"]
         values = np.linspace(0.3, 0.7, 400).tolist()
         for i, value in enumerate(values):
             change = {"kind": "ModelChanged", "model": {"id": slider.id}, "attr": "value", "new": value}
@@ -705,7 +757,7 @@ def test_in_a_browser_a_slider_moves_the_curve(page):
     )
     for name in ("belt_speed", "mu_m"):
         assert explorer_latency.move(page, name, 0.15) > 0.0
-    page.get_by_role("button", name="nominal plant").click()
+    page.get_by_role("button", name="reset to nominal").click()
     page.wait_for_function("Bokeh.documents[0].get_model_by_name('alpha').value === 0.8")
 
 
@@ -718,7 +770,21 @@ def test_in_a_browser_the_agent_suppresses_and_a_picture_is_made(page, tmp_path)
     page.screenshot(path=str(picture))
     assert picture.stat().st_size > 40_000
     readout = page.evaluate("Bokeh.documents[0].get_model_by_name('readout').text")
-    assert "passive 0.393" in readout
+    assert "without control 0.393" in readout
+    assert "● At rest on the sliding belt" in readout
+
+
+@pytest.mark.parametrize("width", [800, 1330, 1920])
+def test_in_a_browser_all_controls_fit_on_the_screen(page, width):
+    page.set_viewport_size({"width": width, "height": 900})
+    for tab in ("friction", "excitation", "oscillator"):
+        page.locator(".bk-tab", has_text=tab).click()
+        for element in (*page.locator("button:visible").all(), *page.locator(".noUi-base:visible").all()):
+            box = element.bounding_box()
+            assert 0 <= box["x"] <= box["x"] + box["width"] <= width
+            assert 0 <= box["y"] <= box["y"] + box["height"] <= 900
+    scrolled = page.evaluate("[document.documentElement.scrollWidth, document.documentElement.scrollHeight]")
+    assert scrolled == [width, 900]
 
 
 def test_in_a_browser_one_takes_over_by_hand(page):
@@ -727,5 +793,5 @@ def test_in_a_browser_one_takes_over_by_hand(page):
     page.wait_for_function("Array.from(Bokeh.documents[0].get_model_by_name('path').data.action).at(-1) === 1")
     page.get_by_text("push the mass (force)").click()
     page.wait_for_function("Array.from(Bokeh.documents[0].get_model_by_name('path').data.v_belt).at(-1) === 0.2")
-    page.get_by_text("basins", exact=True).click()
+    page.get_by_text("basins of attraction").click()
     page.wait_for_function("Bokeh.documents[0].get_model_by_name('message').text.includes('of the starts')")

@@ -23,6 +23,7 @@ from typing import Any, NoReturn
 
 from sd_friction_env import ENVIRONMENT_IDS
 from sd_friction_env.learning import runs
+from sd_friction_env.learning.settings import ALGORITHMS
 
 TASKS = {"force": "Force", "belt": "BeltSpeed"}
 TIERS = {"nominal": "", "randomised": "Randomised", "sensed": "Sensed"}
@@ -77,7 +78,7 @@ def make_parser() -> Parser:
         help="argument of the environment, the value in YAML, such as w_effort=0.2; may be repeated",
     )
     how = parser.add_argument_group("how")
-    how.add_argument("--algo", choices=runs.ALGORITHMS, help="algorithm")
+    how.add_argument("--algo", choices=ALGORITHMS, help="algorithm")
     how.add_argument("--seed", type=int, help="of everything random (default: 0)")
     how.add_argument("--timesteps", type=int, metavar="N", help="environment steps (default: the file's n_timesteps)")
     how.add_argument("--envs", type=int, metavar="N", help="environments side by side (default: the file's n_envs)")
@@ -181,12 +182,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         env_kwargs = assignments("--env-arg", options.env_arg)
         overrides = assignments("--set", options.overrides)
         from sd_friction_env.learning import training
+        from sd_friction_env.learning.plan import check_same, checked_freq, make_plan, plan_of
 
         if by_folder:
-            plan = training.plan_of(config)
+            plan = plan_of(config)
         else:
             same = ("timesteps", "envs", "seed", "eval_freq", "eval_episodes", "device", "threads")
-            plan = training.make_plan(
+            plan = make_plan(
                 env_id,
                 options.algo,
                 env_kwargs=env_kwargs,
@@ -195,9 +197,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 **{name: settings[name] for name in same if name in settings},
             )
         if options.checkpoint_freq is not None:
-            training.checked_freq("checkpoint-freq", options.checkpoint_freq)
+            checked_freq("checkpoint-freq", options.checkpoint_freq)
         if finished:
-            training.check_same(config, plan, options.run_folder)
+            check_same(config, plan, options.run_folder)
             print(f"{options.run_folder} is finished: there is nothing to resume")
             return 0
     except (TypeError, ValueError) as error:

@@ -21,7 +21,7 @@ from pathlib import Path
 from types import FrameType
 
 from scripts.train import TASKS, TIERS, Parser, assignments, environment_id
-from sd_friction_env.learning import runs
+from sd_friction_env.learning.settings import ALGORITHMS
 
 
 def make_parser() -> Parser:
@@ -33,7 +33,7 @@ def make_parser() -> Parser:
     what.add_argument("--task", choices=TASKS, required=True, help="actuator: a force on the mass, or the belt's speed")
     what.add_argument("--tier", choices=TIERS, default="nominal", help="what is hidden (default: nominal)")
     what.add_argument("--env-arg", action="append", default=[], metavar="NAME=VALUE", help="as train.py takes it")
-    what.add_argument("--algo", choices=runs.ALGORITHMS, required=True, help="algorithm")
+    what.add_argument("--algo", choices=ALGORITHMS, required=True, help="algorithm")
     what.add_argument("--hyperparameters", type=Path, metavar="FILE", help="another file to search around")
     what.add_argument(
         "--set",

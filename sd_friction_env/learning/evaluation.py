@@ -443,14 +443,26 @@ def format_summary(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in rows:
         line = [str(row["controller"])]
         for name, form in _FORMATS.items():
-            value, low, high = (row.get(key, float("nan")) for key in (name, f"{name}_low", f"{name}_high"))
-            interval = f" [{form.format(low)}, {form.format(high)}]" if np.isfinite(low) else ""
-            line.append(form.format(value) + interval if np.isfinite(value) else "-")
+            value, interval = cell(row, name, form)
+            line.append(f"{value} {interval}" if interval else value)
         cells.append(line)
-    widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
+    return aligned(cells)
+
+
+def cell(row: Mapping[str, Any], name: str, form: str) -> tuple[str, str]:
+    """Return a value of a summary as text, "-" for no number, and its interval in brackets, "" for none."""
+    value, low, high = (row.get(key, float("nan")) for key in (name, f"{name}_low", f"{name}_high"))
+    if not np.isfinite(value):
+        return "-", ""
+    return form.format(value), f"[{form.format(low)}, {form.format(high)}]" if np.isfinite(low) else ""
+
+
+def aligned(cells: Sequence[Sequence[str]]) -> str:
+    """Return rows of texts, the first one the heading, as a table with a rule under the heading."""
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
     lines = []
-    for line in cells:
-        name, *numbers = (f"{cell:>{width}}" for cell, width in zip(line, widths, strict=True))
-        lines.append("  ".join([line[0].ljust(len(name)), *numbers]))
-    lines.insert(1, "  ".join("-" * w for w in widths))
+    for first, *others in cells:
+        columns = [f"{text:>{width}}" for text, width in zip(others, widths[1:], strict=True)]
+        lines.append("  ".join([first.ljust(widths[0]), *columns]))
+    lines.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join(lines)

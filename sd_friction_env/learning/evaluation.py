@@ -91,6 +91,11 @@ def checked_seeds(seeds: Iterable[Any]) -> list[int]:
     return checked
 
 
+def nominal_draws(env: SDFrictionEnv, n: int) -> dict[str, Array]:
+    """Return the nominal values, shape (n,), of the parameters that an environment draws: nothing is drawn then."""
+    return {name: np.full(n, getattr(env.nominal, name)) for name in env.task.randomise}
+
+
 def run_episodes(
     policy: Policy,
     env_id: str,

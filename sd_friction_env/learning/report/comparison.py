@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env import Table
 from sd_friction_env.control.policies import Actions, ConstantPolicy, Policy, State, ZeroPolicy
-from sd_friction_env.learning import classical, evaluation
+from sd_friction_env.learning import classical, evaluation, scores
 from sd_friction_env.learning import optimal as stored
 from sd_friction_env.learning.report.agents import ENV_IDS, TASKS, Agent, Key, Row, by_algorithm
 
@@ -27,7 +27,7 @@ class Effort:
     """
 
     episodes: int = 100
-    resamples: int = evaluation.RESAMPLES
+    resamples: int = scores.RESAMPLES
     points: int = 33
     phases: int = 4
 
@@ -70,7 +70,7 @@ _WITH_INTERVALS = ("score", "suppressed")
 
 
 def _ends(key: str, groups: Sequence[NDArray[np.float64]], seed: int, resamples: int) -> Row:
-    low, high = evaluation.run_interval(groups, seed=seed, resamples=resamples)
+    low, high = scores.run_interval(groups, seed=seed, resamples=resamples)
     return {f"{key}_low": low, f"{key}_high": high}
 
 
@@ -88,7 +88,7 @@ def over_runs(name: str, summaries: Sequence[Row], *, seed: int, resamples: int)
             continue
         values = np.array([summary[key] for summary in summaries], dtype=float)
         finite = values[np.isfinite(values)]
-        row[key] = evaluation.interquartile_mean(finite) if finite.size else float("nan")
+        row[key] = scores.interquartile_mean(finite) if finite.size else float("nan")
         if key in _WITH_INTERVALS and np.isfinite(values).all():
             ends |= _ends(key, [values], seed, resamples)
     row |= ends  # in place of the means of the runs' own intervals
@@ -175,7 +175,7 @@ def over_tasks(run_rows: Sequence[Row], *, seed: int, resamples: int) -> list[Ro
         row: Row = {"tier": tier, "controller": algorithm, "kind": "learned", "runs": len(mine)}
         for key in _WITH_INTERVALS:
             values = [np.array([one[key] for one in task]) for task in tasks]
-            row[key] = evaluation.interquartile_mean(np.concatenate(values))
+            row[key] = scores.interquartile_mean(np.concatenate(values))
             row |= _ends(key, values, seed, resamples)
         rows.append(row)
     return rows

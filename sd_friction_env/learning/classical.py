@@ -285,6 +285,19 @@ def _mean_returns(controllers: Sequence[Policy], env_id: str) -> NDArray[np.floa
     return means
 
 
+def _costs(name: str, env_id: str, candidates: Sequence[Sequence[float]]) -> NDArray[np.float64]:
+    """Return minus the mean return of a controller with each candidate's values; infinity where there is none."""
+    controllers = {}
+    for i, values in enumerate(candidates):
+        with contextlib.suppress(np.linalg.LinAlgError):  # these weights have no regulator
+            controllers[i] = build(name, env_id, values)
+    costs = np.full(len(candidates), np.inf)
+    built = list(controllers)
+    for some in (built[first : first + _AT_ONCE] for first in range(0, len(built), _AT_ONCE)):
+        costs[some] = -_mean_returns([controllers[i] for i in some], env_id)
+    return costs
+
+
 def tune(
     name: str,
     env_id: str,
@@ -311,14 +324,7 @@ def tune(
     def costs(searched: Any) -> Any:
         nonlocal best, evaluations
         evaluations += searched.shape[1]
-        found = np.full(searched.shape[1], np.inf)
-        controllers = {}
-        for i, places in enumerate(searched.T):
-            with contextlib.suppress(np.linalg.LinAlgError):  # these weights have no regulator
-                controllers[i] = build(name, env_id, values_of(places))
-        made = list(controllers)
-        for some in (made[first : first + _AT_ONCE] for first in range(0, len(made), _AT_ONCE)):
-            found[some] = -_mean_returns([controllers[i] for i in some], env_id)
+        found = _costs(name, env_id, [values_of(places) for places in searched.T])
         best = max(best, -float(found.min()))
         return found
 

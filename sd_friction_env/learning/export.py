@@ -112,9 +112,35 @@ def build(policy: NetworkPolicy, env: SDFrictionEnv, about: dict[str, Any] | Non
         ValueError: if the agent does not fit the environment.
     """
     interface = Interface.of(env)
+    if policy.observation_size != len(interface.names):
+        raise ValueError(
+            f"the agent observes {policy.observation_size} values, and the environment gives {len(interface.names)}"
+        )
+    model = helper.make_model(
+        _graph(policy, interface),
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=_IR_VERSION,
+        producer_name="sd_friction_env",
+        producer_version=sd_friction_env.__version__,
+    )
+    metadata = {
+        "units": "dimensionless: lengths over the spring's free length, times times its frequency",
+        "measurements": list(interface.names),
+        "window": f"the last {policy.frames} measurements, one for each control interval, oldest first",
+        "young_window_is_filled_with": list(interface.rest),
+        "control_interval": env.task.control_interval,
+        "sensor": env.task.sensor,
+        "command": interface.command,
+        **(about or {}),
+    }
+    texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in metadata.items()}
+    helper.set_model_props(model, texts)
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def _graph(policy: NetworkPolicy, interface: Interface) -> onnx.GraphProto:
     k = len(interface.names)
-    if policy.observation_size != k:
-        raise ValueError(f"the agent observes {policy.observation_size} values, and the environment gives {k}")
     constants: dict[str, NDArray[Any]] = {
         "offsets": np.array(interface.offsets),
         "scales": np.array(interface.scales),
@@ -144,44 +170,19 @@ def build(policy: NetworkPolicy, env: SDFrictionEnv, about: dict[str, Any] | Non
         hidden = add("Add", [product, f"bias_{i}"], f"sum_{i}")
         if i + 1 < len(policy.layers):
             hidden = add(_OPERATORS[policy.activation], [hidden], f"hidden_{i}")
-    if policy.output == "clip":
-        hidden = add("Clip", [hidden, "minus_one", "one"], "bounded")
-    else:
-        hidden = add("Tanh", [hidden], "bounded")
-    add("Cast", [hidden], ACTION, to=TensorProto.FLOAT)
+    operator, limits = ("Clip", ["minus_one", "one"]) if policy.output == "clip" else ("Tanh", [])
+    add("Cast", [add(operator, [hidden, *limits], "bounded")], ACTION, to=TensorProto.FLOAT)
     # The command follows from the action in single precision, as it is returned.
     given = add("Cast", [ACTION], "given", to=TensorProto.DOUBLE)
     command = add("Add", [add("Mul", [given, "command_scale"], "change"), "command_offset"], "commanded")
     add("Cast", [command], COMMAND, to=TensorProto.FLOAT)
-    graph = helper.make_graph(
+    return helper.make_graph(
         nodes,
         "agent",
         [helper.make_tensor_value_info(MEASUREMENTS, TensorProto.FLOAT, ["n", policy.frames, k])],
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", 1]) for name in (ACTION, COMMAND)],
         [numpy_helper.from_array(value, name) for name, value in constants.items()],
     )
-    model = helper.make_model(
-        graph,
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=_IR_VERSION,
-        producer_name="sd_friction_env",
-        producer_version=sd_friction_env.__version__,
-    )
-    metadata = {
-        "units": "dimensionless: lengths over the spring's free length, times times its frequency",
-        "measurements": list(interface.names),
-        "window": f"the last {policy.frames} measurements, one for each control interval, oldest first",
-        "young_window_is_filled_with": list(interface.rest),
-        "control_interval": env.task.control_interval,
-        "sensor": env.task.sensor,
-        "command": interface.command,
-        **(about or {}),
-    }
-    helper.set_model_props(
-        model, {name: value if isinstance(value, str) else json.dumps(value) for name, value in metadata.items()}
-    )
-    onnx.checker.check_model(model, full_check=True)
-    return model
 
 
 def session(model: onnx.ModelProto | Path) -> onnxruntime.InferenceSession:

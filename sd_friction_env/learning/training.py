@@ -78,7 +78,7 @@ def validate(policy: Policy, plan: Plan) -> dict[str, float]:
     """Return the means over a plan's validation episodes, as the rows of evaluations.csv have them.
 
     ``credited_return`` is the mean of the returns in which an episode that is not suppressed counts no more than a
-    passive one: by return alone, a belt that runs slow for ever would beat one that returns to its speed.
+    passive one: by return alone, a belt that stays slow would beat one that returns to its speed.
     """
     seeds = plan.validation_seeds
     passive = evaluation.passive_episodes(plan.env_id, seeds, plan.env_kwargs)

@@ -90,7 +90,7 @@ def test_a_run_that_is_not_what_its_name_says_or_is_damaged_is_refused(tmp_path)
     config = json.loads((strange / runs.CONFIG).read_text())
     config["files"][runs.EVALUATIONS] = file_digest(strange / runs.EVALUATIONS)
     write_json(strange / runs.CONFIG, config)
-    with pytest.raises(runs.RunFolderError, match="must have the columns"):
+    with pytest.raises(runs.RunFolderError, match="must have columns of numbers"):
         report.find_agents(strange.parent)
     (damaged / runs.NETWORK).write_bytes(b"x")
     with pytest.raises(runs.RunFolderError, match="damaged"):

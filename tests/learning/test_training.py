@@ -4,6 +4,7 @@ import ast
 import contextlib
 import dataclasses
 import hashlib
+import inspect
 import json
 import pickle
 import signal
@@ -319,7 +320,8 @@ def test_a_pickle_in_place_of_the_weights_is_refused_and_never_run(copied, tmp_p
 
 
 def test_no_code_here_unpickles_or_evaluates():
-    for path in [*(ROOT / "agents").glob("*.py"), ROOT / "scripts/train.py", ROOT / "scripts/evaluate.py"]:
+    programs = (ROOT / "scripts/train.py", ROOT / "scripts/evaluate.py")
+    for path in [*(ROOT / "sd_friction_env/learning").rglob("*.py"), *programs]:
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.Call):
                 continue
@@ -432,6 +434,12 @@ def test_rl_zoo_trains_from_the_same_files(algorithm, tmp_path):
     what = ["--algo", algorithm, "--env", BELT, "--gym-packages", "sd_friction_env", "-n", "500", "-f", str(tmp_path)]
     file = ["--conf-file", str(storage.HYPERPARAMETERS / f"{algorithm}.yml"), "--eval-freq", "-1", "--device", "cpu"]
     subprocess.run([sys.executable, "-m", "rl_zoo3.train", *what, *file], check=True, cwd=tmp_path, timeout=300)
+
+
+@pytest.mark.parametrize("algorithm", settings.ALGORITHMS)
+def test_every_hyperparameter_is_an_argument_of_its_algorithm(algorithm):
+    taken = inspect.signature(networks.ALGORITHM_CLASSES[algorithm]).parameters
+    assert set(settings.allowed_hyperparameters(algorithm)) - set(settings.OURS) <= set(taken)
 
 
 @pytest.mark.parametrize("value", [10**400, -(10**5000), 1j], ids=["large", "larger", "complex"])

@@ -38,31 +38,3 @@ from sd_friction_env.learning.optimal.stored import (
 )
 from sd_friction_env.learning.optimal.study import find_optimum
 from sd_friction_env.learning.versions import versions
-
-__all__ = [
-    "ACTION_LEVELS",
-    "OPTIMUM_DIRECTORY",
-    "RANDOMISED",
-    "SENSED",
-    "TASKS",
-    "DamagedStudyError",
-    "OptimalPolicy",
-    "Problem",
-    "ValueFunction",
-    "find_optimum",
-    "fingerprint",
-    "greedy_actions",
-    "grid_actions",
-    "make_grid",
-    "make_problem",
-    "optimal_actions",
-    "optimal_returns",
-    "refine",
-    "save_optimum",
-    "save_value",
-    "settle",
-    "stored_returns",
-    "stored_study",
-    "value_iteration",
-    "versions",
-]

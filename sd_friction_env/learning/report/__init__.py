@@ -24,28 +24,3 @@ from sd_friction_env.learning.report.curves import (
     training_times,
 )
 from sd_friction_env.learning.report.document import Report
-
-__all__ = [
-    "ENV_IDS",
-    "FULL",
-    "QUICK",
-    "SWEEPS",
-    "TASKS",
-    "TIERS",
-    "Agent",
-    "Comparison",
-    "Effort",
-    "Key",
-    "Replay",
-    "Report",
-    "Row",
-    "compare",
-    "find_agents",
-    "history",
-    "learning_curves",
-    "over_runs",
-    "over_tasks",
-    "sweep_plants",
-    "swept_parameters",
-    "training_times",
-]

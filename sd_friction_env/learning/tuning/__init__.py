@@ -19,24 +19,3 @@ from sd_friction_env.learning.tuning.study import (
 )
 from sd_friction_env.learning.tuning.trial import run_plan
 from sd_friction_env.learning.tuning.workers import InterruptedStudyError, WorkersDiedError, tune, work
-
-__all__ = [
-    "PRUNERS",
-    "SPACES",
-    "Dimension",
-    "InterruptedStudyError",
-    "Search",
-    "StudyError",
-    "WorkersDiedError",
-    "best_trials",
-    "check_out",
-    "finished_trials",
-    "format_trials",
-    "make_search",
-    "open_study",
-    "run_plan",
-    "search_space",
-    "tune",
-    "work",
-    "write_best",
-]

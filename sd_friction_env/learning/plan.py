@@ -16,11 +16,11 @@ from sd_friction_env.learning.settings import (
     NOISES,
     check_hyperparameter,
     check_hyperparameters,
-    checked_one_of,
     checked_whole,
     one_line,
     read_hyperparameters,
 )
+from sd_friction_env.physics.parameters import checked_choice
 
 LARGEST_SEED = 2**32 - 1
 
@@ -112,7 +112,7 @@ def make_plan(
     Raises:
         TypeError, ValueError: naming the argument, its value and what is allowed.
     """
-    checked_one_of("env-id", env_id, ENVIRONMENT_IDS)
+    checked_choice("env-id", env_id, ENVIRONMENT_IDS)
     settings = read_hyperparameters(algorithm, env_id, hyperparameter_file)
     settings |= check_hyperparameters(algorithm, dict(overrides or {}))
     for name, shown, value in (("n_timesteps", "timesteps", timesteps), ("n_envs", "envs", envs)):
@@ -139,10 +139,10 @@ def plan_of(config: Mapping[str, Any]) -> Plan:
         RunFolderError: if it describes none.
     """
     try:
-        environment, algorithm = config["environment"], checked_one_of("algorithm", config["algorithm"], ALGORITHMS)
+        environment, algorithm = config["environment"], checked_choice("algorithm", config["algorithm"], ALGORITHMS)
         settings = check_hyperparameters(algorithm, config["hyperparameters"])
         plan = Plan(
-            env_id=checked_one_of("environment", environment["id"], ENVIRONMENT_IDS),
+            env_id=checked_choice("environment", environment["id"], ENVIRONMENT_IDS),
             env_kwargs=environment["kwargs"],
             algorithm=algorithm,
             hyperparameters=settings,

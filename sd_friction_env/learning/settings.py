@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sd_friction_env.environments.wrappers import LARGEST_POWER, LARGEST_SCALE, SMALLEST_POWER, SMALLEST_SCALE
-from sd_friction_env.physics.parameters import brief_repr, checked_number
+from sd_friction_env.physics.parameters import brief_repr, checked_choice, checked_number
 from sd_friction_env.storage import HYPERPARAMETERS, StoredFileError, read_yaml
 
 OFF_POLICY = ("sac", "td3", "tqc")
@@ -45,17 +45,6 @@ def checked_whole(name: str, value: Any, low: int, high: int) -> int:
     return int(number)
 
 
-def checked_one_of(name: str, value: Any, choices: Sequence[str]) -> str:
-    """Return ``value`` if it is one of ``choices``.
-
-    Raises:
-        ValueError: if it is not.
-    """
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {brief_repr(value)}")
-    return str(value)
-
-
 def _number(low: float, high: float) -> Check:
     return lambda name, value: checked_number(name, value, low, high)
 
@@ -65,7 +54,7 @@ def _whole(low: int, high: int) -> Check:
 
 
 def _one_of(*choices: str) -> Check:
-    return lambda name, value: checked_one_of(name, value, choices)
+    return lambda name, value: checked_choice(name, value, choices)
 
 
 def _flag(name: str, value: Any) -> bool:
@@ -201,7 +190,7 @@ def _literal(node: ast.expr) -> Any:
         case ast.List(elts=elements):
             return [_literal(part) for part in elements]
         case ast.Attribute(value=ast.Name(id="nn"), attr=name):
-            return checked_one_of("activation_fn", name, ACTIVATIONS)
+            return checked_choice("activation_fn", name, ACTIVATIONS)
     try:
         return ast.literal_eval(node)
     except (ValueError, TypeError):
@@ -300,7 +289,7 @@ def read_hyperparameters(algorithm: str, env_id: str, path: Path | None = None) 
     Raises:
         ValueError: if the algorithm is unknown, the file cannot be read or a value is not allowed, naming it.
     """
-    checked_one_of("algo", algorithm, ALGORITHMS)
+    checked_choice("algo", algorithm, ALGORITHMS)
     file = HYPERPARAMETERS / f"{algorithm}.yml" if path is None else path
     try:
         content = read_yaml(file)

@@ -292,7 +292,7 @@ def test_weights_that_do_not_fit_are_refused(copied):
         runs.load_torch_policy(copied)
     config["hyperparameters"]["policy_kwargs"]["activation_fn"] = "os.system"
     storage.write_json(copied / "config.json", config)
-    with pytest.raises(runs.RunFolderError, match="activation_fn must be one of Tanh, ReLU"):
+    with pytest.raises(runs.RunFolderError, match="activation_fn must be one of 'Tanh', 'ReLU'"):
         runs.load_torch_policy(copied)
 
 
@@ -378,11 +378,11 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
         (["--set", "gamma"], "--set must be NAME=VALUE"),
         (["--set", "tau=0.1"], "ppo has no hyperparameter 'tau'"),
         (["--set", "learning_rate=exp_1"], "learning_rate must be"),
-        (["--set", "policy=CnnPolicy"], "policy must be one of MlpPolicy, got 'CnnPolicy'"),
+        (["--set", "policy=CnnPolicy"], "policy must be one of 'MlpPolicy', got 'CnnPolicy'"),
         (["--set", "env_wrapper=os.system"], "env_wrapper must be"),
         (["--set", "policy_kwargs=dict(net_arch=open('x'))"], "policy_kwargs may hold literals"),
         (["--set", "policy_kwargs=dict(net_arch=[0])"], "a width in net_arch must be"),
-        (["--set", "policy_kwargs=dict(activation_fn=nn.Module)"], "activation_fn must be one of Tanh, ReLU"),
+        (["--set", "policy_kwargs=dict(activation_fn=nn.Module)"], "activation_fn must be one of 'Tanh', 'ReLU'"),
         (["--env-arg", "w_effort=-1"], "w_effort must be a finite number in [0, 1e+06], got -1"),
         (["--env-arg", "colour=red"], "unexpected keyword argument 'colour'"),
         (["--hyperparameters", "gone.yml"], "cannot be read from 'gone.yml'"),

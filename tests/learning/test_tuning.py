@@ -395,7 +395,7 @@ def _states(database):
         (["--trials", "0"], r"trials must be a whole number in \[1, \d+\], got 0"),
         (["--workers", "-1"], r"workers must be a whole number in \[1, 256\], got -1"),
         (["--evaluations", "513"], r"evaluations must be a whole number in \[1, 512\], got 513"),
-        (["--pruner", "rose"], r"pruner must be one of median, hyperband, none, got 'rose'"),
+        (["--pruner", "rose"], r"pruner must be one of 'median', 'hyperband', 'none', got 'rose'"),
         (["--seed", "-1"], r"seed must be a whole number in \[0, 4294967295\], got -1"),
         (["--timesteps", "0"], r"timesteps must be a whole number"),
         (["--study", " "], r"study must be a name of 1 to 200 characters"),

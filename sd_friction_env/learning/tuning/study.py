@@ -20,8 +20,9 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from sd_friction_env.learning import training
 from sd_friction_env.learning.plan import Plan, make_plan
-from sd_friction_env.learning.settings import checked_one_of, checked_whole
+from sd_friction_env.learning.settings import checked_whole
 from sd_friction_env.learning.tuning.space import Dimension, search_space
+from sd_friction_env.physics.parameters import checked_choice
 from sd_friction_env.storage import content_digest
 
 FORMAT = 1  # of the configuration that a study stores
@@ -113,7 +114,7 @@ def make_search(
     Raises:
         TypeError, ValueError: naming the argument, its value and what is allowed.
     """
-    checked_one_of("pruner", pruner, PRUNERS)
+    checked_choice("pruner", pruner, PRUNERS)
     centre = make_plan(env_id, algorithm, eval_episodes=eval_episodes, **plan)
     checked_whole("evaluations", evaluations, 1, centre.steps)
     space = search_space(algorithm, centre.hyperparameters, list(plan.get("overrides") or {}))

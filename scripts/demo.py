@@ -21,6 +21,7 @@ from scripts.figures import common, paper
 from sd_friction_env import OscillatorParameters, SDFrictionEnv, Table, limit_cycle, simulate
 from sd_friction_env.control.policies import Policy, ZeroPolicy
 from sd_friction_env.learning import classical, evaluation, training
+from sd_friction_env.learning.plan import make_plan
 from sd_friction_env.physics.simulation import Trajectory, amplitude
 from sd_friction_env.pictures import plotting
 
@@ -108,7 +109,7 @@ def compare(task: str, policies: dict[str, Policy]) -> list[dict[str, Any]]:
 
 def train(task: str, out: Path, seed: int, timesteps: int | None) -> training.Result:
     """Train PPO for a task; the run folder is a new one."""
-    plan = training.make_plan(TASKS[task], "ppo", seed=seed, timesteps=timesteps)
+    plan = make_plan(TASKS[task], "ppo", seed=seed, timesteps=timesteps)
     command = " ".join(["python", "scripts/demo.py", *sys.argv[1:]])
     result = training.train(plan, out / "runs" / f"{task}-ppo", force=True, command=command)
     print(f"{result.steps:,} steps in {result.seconds:.0f} s", flush=True)

@@ -27,6 +27,7 @@ from tqdm import tqdm
 from sd_friction_env.cli.options import TASKS, TIERS, Parser, environment_id
 from sd_friction_env.control.pretrained import fingerprint, pretrained_file
 from sd_friction_env.learning import evaluation, runs
+from sd_friction_env.learning.settings import ALGORITHMS
 
 ROOT = Path(__file__).resolve().parent.parent
 PRETRAINED = ROOT / "agents" / "pretrained"
@@ -112,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--only", nargs="+", choices=NAMES, default=NAMES, metavar="NAME", help=f"of {', '.join(NAMES)}"
     )
-    parser.add_argument("--algo", nargs="+", choices=runs.ALGORITHMS, default=["ppo"], help="default: ppo")
+    parser.add_argument("--algo", nargs="+", choices=ALGORITHMS, default=["ppo"], help="default: ppo")
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="train seeds 0 to N - 1 (default: 5)")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="runs at a time (default: 2)")
     parser.add_argument("--package-only", action="store_true", help="train nothing")

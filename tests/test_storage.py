@@ -14,7 +14,7 @@ import yaml
 
 from scripts.hunting import files as hunt_files
 from sd_friction_env import storage
-from sd_friction_env.learning import training
+from sd_friction_env.learning.settings import ALGORITHMS
 from sd_friction_env.storage import HYPERPARAMETERS, LockedError, StoredFileError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -135,7 +135,7 @@ def test_a_predecessor_is_kept_and_named(tmp_path):
 # YAML -----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algorithm", training.ALGORITHMS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_projects_yaml_is_read_as_pyyaml_reads_it(algorithm):
     path = HYPERPARAMETERS / f"{algorithm}.yml"
     assert storage.read_yaml(path) == yaml.safe_load(path.read_text())

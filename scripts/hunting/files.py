@@ -32,7 +32,8 @@ import torch
 from sd_friction_env import Table
 from sd_friction_env.cli.options import Parser, assignments
 from sd_friction_env.control.policies import NetworkPolicy, load_policy
-from sd_friction_env.learning import classical, optimal, runs, training
+from sd_friction_env.learning import checkpoints, classical, optimal, runs, settings, tensors, training
+from sd_friction_env.learning.plan import make_plan
 from sd_friction_env.physics.sweeps import Engine, run_chunks
 from sd_friction_env.storage import HYPERPARAMETERS, read_json, sealed_archive, write_json
 
@@ -51,7 +52,7 @@ def _policy(path: Path) -> None:
 
 def _checkpoints(folder: Path, seed: int = 0) -> Path:
     """Train a tiny run until it has two checkpoints; return its partial folder."""
-    plan = training.make_plan(
+    plan = make_plan(
         FORCE,
         "ppo",
         env_kwargs={"episode_steps": 40},
@@ -105,8 +106,8 @@ def _readers(base: Path) -> dict[str, tuple[Path, Reader]]:
         "run": (base / "run" / "config.json", lambda path: runs.load_network(path.parent)),
         "weights": (base / "run" / "policy.pt", lambda path: runs.load_torch_policy(path.parent)),
         "network": (base / "run" / "policy.npz", lambda path: runs.load_network(path.parent)),
-        "tensors": (base / "run" / "policy.pt", runs.load_tensors),
-        "hyperparameters": (base / "ppo.yml", lambda path: training.read_hyperparameters("ppo", FORCE, path)),
+        "tensors": (base / "run" / "policy.pt", tensors.load_tensors),
+        "hyperparameters": (base / "ppo.yml", lambda path: settings.read_hyperparameters("ppo", FORCE, path)),
         "manifest": (base / "sweep" / "sweep.json", _sweep),
         "chunk": (chunk, _sweep),
         "table": (base / "run" / "evaluations.csv", Table.from_csv),
@@ -439,7 +440,7 @@ def _check_checkpoint_bits(base: Path, rng: np.random.Generator, count: int = 10
         last.write_bytes(_flipped(good, place))
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            found = training._last_whole_checkpoint([last, before])
+            found = checkpoints.last_whole_checkpoint([last, before])
         is_held = found is not None and found[0] == before and len(said) == 1 and last.name in str(said[0].message)
         yield f"bit {place} of a checkpoint", "" if is_held else "resumed from unnoticed, or not by name"
     last.write_bytes(good)

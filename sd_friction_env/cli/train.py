@@ -19,6 +19,7 @@ from sd_friction_env.cli.options import (
     stop_requests,
 )
 from sd_friction_env.learning import runs
+from sd_friction_env.learning.settings import ALGORITHMS
 
 TEXT = """\
 The hyperparameters are the tuned ones of agents/hyperparameters/ALGO.yml (sd-friction hyperparameters ALGO); --set
@@ -51,7 +52,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     what = parser.add_argument_group("what to train")
     add_environment(what)
     how = parser.add_argument_group("how")
-    how.add_argument("--algo", choices=runs.ALGORITHMS, help="algorithm")
+    how.add_argument("--algo", choices=ALGORITHMS, help="algorithm")
     how.add_argument("--seed", type=int, help="of everything random (default: 0)")
     how.add_argument("--timesteps", type=int, metavar="N", help="environment steps (default: the file's n_timesteps)")
     how.add_argument("--envs", type=int, metavar="N", help="environments side by side (default: the file's n_envs)")
@@ -107,12 +108,12 @@ def _planned(options: argparse.Namespace) -> tuple[Any, bool, bool]:
         config = runs.load_unfinished(options.run_folder, force=options.force)
     env_kwargs = assignments("--env-arg", options.env_arg)
     overrides = assignments("--set", options.overrides)
-    from sd_friction_env.learning import training
+    from sd_friction_env.learning.plan import check_same, checked_freq, make_plan, plan_of
 
     if by_folder:
-        plan = training.plan_of(config)
+        plan = plan_of(config)
     else:
-        plan = training.make_plan(
+        plan = make_plan(
             env_id,
             options.algo,
             env_kwargs=env_kwargs,
@@ -121,9 +122,9 @@ def _planned(options: argparse.Namespace) -> tuple[Any, bool, bool]:
             **{name: settings[name] for name in _PLANNED if name in settings},
         )
     if options.checkpoint_freq is not None:
-        training.checked_freq("checkpoint-freq", options.checkpoint_freq)
+        checked_freq("checkpoint-freq", options.checkpoint_freq)
     if finished:
-        training.check_same(config, plan, options.run_folder)
+        check_same(config, plan, options.run_folder)
     return plan, found, finished
 
 

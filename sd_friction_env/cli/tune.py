@@ -18,7 +18,8 @@ from sd_friction_env.cli.options import (
     stop_requests,
 )
 from sd_friction_env.extras import extra
-from sd_friction_env.learning import classical, runs
+from sd_friction_env.learning import classical
+from sd_friction_env.learning.settings import ALGORITHMS
 
 TEXT = """\
 The search is around the hyperparameters of agents/hyperparameters/ALGO.yml. A trial is worth the best credited return
@@ -39,7 +40,7 @@ side. All of them take a quarter of an hour."""
 def _add_tune(parser: argparse.ArgumentParser) -> None:
     what = parser.add_argument_group("what is searched")
     add_environment(what)
-    what.add_argument("--algo", choices=runs.ALGORITHMS, required=True, help="algorithm")
+    what.add_argument("--algo", choices=ALGORITHMS, required=True, help="algorithm")
     what.add_argument("--hyperparameters", type=Path, metavar="FILE", help="another file to search around")
     what.add_argument(
         "--set",

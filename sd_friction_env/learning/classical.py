@@ -1,8 +1,8 @@
-"""Classical controllers, each tuned on a task's own objective, and kept with the command that tuned them.
+"""Classical controllers, each tuned on a task's own objective, and stored with the command that tuned them.
 
-The objective is the mean return over the validation episodes: what the agents are trained for, and never the episodes
-of the report. It may prefer a controller that runs the belt slow to one that suppresses the vibration; the share of
-suppressed episodes is kept beside it.
+The objective is the mean return over the validation episodes, as in training, and never over the report's episodes. A
+controller that runs the belt slow may have a higher return than one that suppresses the vibration; the share of
+suppressed episodes is stored with it.
 """
 
 import contextlib
@@ -20,7 +20,6 @@ import scipy.linalg
 import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
-import sd_friction_env
 from sd_friction_env import ENVIRONMENT_IDS, SDFrictionEnv
 from sd_friction_env.control.policies import (
     Actions,
@@ -34,14 +33,15 @@ from sd_friction_env.control.policies import (
     VelocityFeedback,
 )
 from sd_friction_env.learning import evaluation
+from sd_friction_env.learning.versions import versions
 from sd_friction_env.storage import AGENTS, locked, predecessor_hint, read_json, write_json
 
 GAINS_FILE = AGENTS / "classical.json"
 TUNING_SEEDS = evaluation.VALIDATION_SEEDS[:32]
 
 _DIFFERENCE = 1e-5
-_AT_ONCE = 32  # controllers side by side: more are no faster, and want more memory
-_AT_BOUND = 0.01  # of a range: from there on a value counts as at its bound
+_AT_ONCE = 32  # controllers side by side: more are no faster and need more memory
+_AT_BOUND = 0.01  # of a range: a value this close to a bound counts as at it
 
 
 class NotTunedError(ValueError):
@@ -50,13 +50,13 @@ class NotTunedError(ValueError):
 
 @dataclass(frozen=True)
 class Range:
-    """Where a value is looked for, and on what scale.
+    """Range of a tuned value, and the scale of its search.
 
     Attributes:
         low, high: its bounds.
-        unit: None: as it is; else on a symmetric logarithm, asinh(value/unit), which is even in the order of magnitude
-            from the unit on, so that the bounds may stand far outside of what is wanted.
-        low_is, high_is: what a controller at that bound is, where the bound is no mere end of the search.
+        unit: None: a linear scale; otherwise a symmetric logarithm, asinh(value/unit), which is even in the order of
+            magnitude beyond the unit, so that the bounds may be far outside the useful range.
+        low_is, high_is: meaning of a value at that bound; "" if the bound is only the end of the search.
     """
 
     low: float
@@ -66,17 +66,16 @@ class Range:
     high_is: str = ""
 
     def to_scale(self, value: float) -> float:
-        """Return a value as it is searched."""
+        """Return a value on the scale of the search."""
         return value if self.unit is None else math.asinh(value / self.unit)
 
     def from_scale(self, searched: float) -> float:
-        """Return the value of what is searched, within the bounds to the bit."""
+        """Return the value at a place on the scale of the search, within the bounds to the bit."""
         value = searched if self.unit is None else self.unit * math.sinh(searched)
         return min(max(value, self.low), self.high)
 
     def bound_at(self, value: float) -> str | None:
-        """Return "low" or "high" if the value lies within 1% of the range from that bound on the scale of the search,
-        else None."""
+        """Return "low" or "high" if the value is within 1% of the search's scale of that bound, or None."""
         low, place, high = (self.to_scale(number) for number in (self.low, value, self.high))
         near = _AT_BOUND * (high - low)
         return "low" if place < low + near else "high" if place > high - near else None
@@ -84,12 +83,12 @@ class Range:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of controller and what is tuned of it.
+    """A kind of controller and its tuned values.
 
     Attributes:
-        build: makes it from an environment and the tuned values, in the order of ``ranges``.
+        build: from an environment and the tuned values, in the order of ``ranges``.
         ranges: of each value, by name.
-        needs_velocity: whether it needs the sensor "state" (else: it is for the sensors that see x alone, or all).
+        needs_velocity: whether it needs the sensor "state" (otherwise it is for the sensors that see x alone).
         everywhere: whether it is for both kinds of sensors.
     """
 
@@ -131,8 +130,10 @@ def _sliding(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
 
 
 def _gain(unit: float) -> Range:
-    """Return the range of a gain; the unit is what turns an observation of 1 into an action of 1. Feedback is a mere
-    switch long before 1e4 of it."""
+    """Return the range of a gain in units of the gain that turns an observation of 1 into an action of 1.
+
+    Feedback acts as a switch long before 1e4 of them.
+    """
     return Range(-1e4 * unit, 1e4 * unit, unit)
 
 
@@ -197,8 +198,8 @@ def kinds_for(env_id: str) -> list[str]:
 def linearised(env: SDFrictionEnv) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return A, shape (k, k), and B, shape (k, 1), of the nominal plant's step about its steady-slip equilibrium.
 
-    The state is what a controller reads (see ``Readings.names``); differences of the environment's own step, so that
-    the hold over an interval and the belt's inertia are in them.
+    The state is what a controller reads (see ``Readings.names``). The matrices are differences of the environment's own
+    step, so that they include the hold over an interval and the belt's inertia.
     """
     readings = Readings.from_env(env)
     k = len(readings.names)
@@ -215,7 +216,7 @@ def linearised(env: SDFrictionEnv) -> tuple[NDArray[np.float64], NDArray[np.floa
 
     h = _DIFFERENCE
     a = np.stack([(step(h * e, 0.0) - step(-h * e, 0.0)) / (2.0 * h) for e in np.eye(k)], axis=1)
-    # The action is float32 in use, not here.
+    # Actions are float32 in use, and float64 here.
     b = (step(np.zeros(k), h) - step(np.zeros(k), -h)) / (2.0 * h)
     return a, b[:, None]
 
@@ -253,7 +254,7 @@ def build(name: str, env_id: str, values: Sequence[float]) -> Policy:
 
 @dataclass(frozen=True)
 class _SideBySide:
-    """Several controllers, each with as many of the observations, in order."""
+    """Several controllers, each for an equal share of the observations, in order."""
 
     controllers: Sequence[Policy]
 
@@ -264,24 +265,37 @@ class _SideBySide:
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
     ) -> tuple[Actions, State]:
-        """Return the actions of all, and what they remember."""
+        """Return the actions of all, and their states."""
         count = len(self.controllers)
         seen = np.split(np.asarray(observation), count)
         starts = np.split(np.broadcast_to(np.asarray(episode_start, dtype=bool), (len(seen[0]) * count,)), count)
         states = [None] * count if state is None else cast(Any, state)
-        told = [
+        predicted = [
             controller.predict(what, before, begun, deterministic)
             for controller, what, before, begun in zip(self.controllers, seen, states, starts, strict=True)
         ]
-        return np.concatenate([actions for actions, _ in told]), cast(Any, tuple(state for _, state in told))
+        return np.concatenate([actions for actions, _ in predicted]), cast(Any, tuple(state for _, state in predicted))
 
 
 def _mean_returns(controllers: Sequence[Policy], env_id: str) -> NDArray[np.float64]:
-    """Return the mean return of each over the episodes that tuning sees, all side by side."""
+    """Return the mean return of each controller over the tuning episodes, all side by side."""
     seeds = list(TUNING_SEEDS) * len(controllers)
     episodes = evaluation.run_episodes(_SideBySide(controllers), env_id, seeds)
     means: NDArray[np.float64] = np.nansum(episodes.reward, axis=1).reshape(-1, len(TUNING_SEEDS)).mean(axis=1)
     return means
+
+
+def _costs(name: str, env_id: str, candidates: Sequence[Sequence[float]]) -> NDArray[np.float64]:
+    """Return minus the mean return of a controller with each candidate's values; infinity where there is none."""
+    controllers = {}
+    for i, values in enumerate(candidates):
+        with contextlib.suppress(np.linalg.LinAlgError):  # these weights have no regulator
+            controllers[i] = build(name, env_id, values)
+    costs = np.full(len(candidates), np.inf)
+    built = list(controllers)
+    for some in (built[first : first + _AT_ONCE] for first in range(0, len(built), _AT_ONCE)):
+        costs[some] = -_mean_returns([controllers[i] for i in some], env_id)
+    return costs
 
 
 def tune(
@@ -293,12 +307,12 @@ def tune(
     population: int = 12,
     progress: Callable[[float, float], None] = lambda best, share: None,
 ) -> dict[str, Any]:
-    """Return the best values of a controller that differential evolution finds, and what they came to.
+    """Return the best values of a controller that differential evolution finds, with their results.
 
     Args:
         name: in ``kinds_for(env_id)``. seed: of the search. generations, population: of SciPy's
             ``differential_evolution``, the population per tuned value.
-        progress: told the best mean return so far and the share of the generations done.
+        progress: called with the best mean return so far and the share of the generations done.
     """
     ranges = KINDS[name].ranges(_nominal_env(env_id))
     best = -np.inf
@@ -310,18 +324,11 @@ def tune(
     def costs(searched: Any) -> Any:
         nonlocal best, evaluations
         evaluations += searched.shape[1]
-        found = np.full(searched.shape[1], np.inf)
-        controllers = {}
-        for i, places in enumerate(searched.T):
-            with contextlib.suppress(np.linalg.LinAlgError):  # no regulator for such weights
-                controllers[i] = build(name, env_id, values_of(places))
-        made = list(controllers)
-        for some in (made[first : first + _AT_ONCE] for first in range(0, len(made), _AT_ONCE)):
-            found[some] = -_mean_returns([controllers[i] for i in some], env_id)
+        found = _costs(name, env_id, [values_of(places) for places in searched.T])
         best = max(best, -float(found.min()))
         return found
 
-    def told(*_: Any) -> None:
+    def report(*_: Any) -> None:
         nonlocal done
         done += 1
         progress(best, done / generations)
@@ -338,7 +345,7 @@ def tune(
         polish=False,
         vectorized=True,
         updating="deferred",
-        callback=told,
+        callback=report,
     )
     values = dict(zip(ranges, values_of(found.x), strict=True))
     return {
@@ -352,7 +359,7 @@ def tune(
 
 
 def measured(name: str, env_id: str, values: Mapping[str, float]) -> dict[str, float]:
-    """Return what a controller with such values comes to in the validation episodes."""
+    """Return the results of a controller with these values in the validation episodes."""
     table = evaluation.evaluate(_with(name, env_id, values), env_id, evaluation.VALIDATION_SEEDS)
     return {
         "tuning_return": float(table["return"][: len(TUNING_SEEDS)].mean()),  # those come first
@@ -362,8 +369,7 @@ def measured(name: str, env_id: str, values: Mapping[str, float]) -> dict[str, f
 
 
 def at_bound(name: str, env_id: str, values: Mapping[str, float]) -> dict[str, str]:
-    """Return the values that lie at a bound of the search, each with what such a controller is ("" if the bound is the
-    mere end of the search, and wider bounds may find a better one)."""
+    """Return the values at a bound of the search, each with its meaning ("": wider bounds may find a better one)."""
     found = {}
     for key, way in KINDS[name].ranges(_nominal_env(env_id)).items():
         bound = way.bound_at(values[key])
@@ -376,19 +382,14 @@ def _with(name: str, env_id: str, values: Mapping[str, float]) -> Policy:
     return build(name, env_id, [values[key] for key in KINDS[name].ranges(_nominal_env(env_id))])
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of what tunes."""
-    return {"sd_friction_env": sd_friction_env.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
-
-
 def stored_gains(path: Path | None = None) -> dict[str, dict[str, Any]]:
-    """Return what is stored: by environment id and controller, what :func:`tune` returned and the command.
+    """Return the stored gains: by environment id and controller, what :func:`tune` returned and the command.
 
     Args:
-        path: of the file; None: the one that comes with the project.
+        path: of the file; None: the one shipped.
 
     Raises:
-        ValueError: if the file is not one of ours.
+        ValueError: if the file does not hold gains.
     """
     path = GAINS_FILE if path is None else path
     if not path.exists():
@@ -410,18 +411,18 @@ def stored_gains(path: Path | None = None) -> dict[str, dict[str, Any]]:
 
 
 def keep(env_id: str, name: str, found: Mapping[str, Any], path: Path | None = None) -> dict[str, Any]:
-    """Store what :func:`tune` found unless what is stored does better in the environment as it is now; return what is
-    stored then.
+    """Store what :func:`tune` found unless the stored entry is better in the present environment; return the entry that
+    is then stored.
 
-    Whatever else is stored stays as it is, whoever stores at the same time; the file is written whole or not at all,
-    and its predecessor is kept as "NAME.previous".
+    Other entries stay unchanged, also if another process stores at the same time. The file is written whole or not at
+    all, and its predecessor is kept as "NAME.previous".
 
     Args:
         env_id, name: of the environment and the controller. found: of :func:`tune`, with the command.
         path: of the gains, as :func:`stored_gains` takes it.
 
     Raises:
-        ValueError: if the file is not one of ours. OSError: if it cannot be written.
+        ValueError: if the file does not hold gains. OSError: if it cannot be written.
     """
     path = GAINS_FILE if path is None else path
     with locked(path.with_name(f".{path.name}.lock"), repr(str(path)), wait=True):
@@ -445,7 +446,7 @@ def classical_controllers(env_id: str, path: Path | None = None) -> dict[str, Po
         env_id: its id. path: of the gains, as :func:`stored_gains` takes it.
 
     Raises:
-        NotTunedError: if none is stored for it. ValueError: if the file is not one of ours.
+        NotTunedError: if none is stored for it. ValueError: if the file does not hold gains.
     """
     env_id = env_id.rpartition(":")[2]
     found = stored_gains(path).get(env_id)

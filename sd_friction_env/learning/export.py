@@ -1,7 +1,7 @@
-"""Trained agents as ONNX: from what is measured to what is commanded, with nothing of ours needed to run it.
+"""Trained agents as ONNX: from measurements to commands, without this package at run time.
 
 The graph takes physical measurements (dimensionless), scales and clips them as the environment does, runs the network
-in double precision, and gives the action in [-1, 1] and the command that it stands for.
+in double precision, and returns the action in [-1, 1] and the command that it means.
 """
 
 import json
@@ -34,16 +34,16 @@ Measurements = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Interface:
-    """What a controller measures and commands, all dimensionless.
+    """Measurements and command of a controller, all dimensionless.
 
-    Where the plant's own belt speed is drawn anew for each episode, no constant tells what the belt's speed means: it
-    is then measured and commanded in units of the plant's nominal one (``v_belt/belt_speed``), which its operator sets.
+    Where each episode draws the plant's belt speed, the belt's speed is measured and commanded in units of the plant's
+    nominal speed (``v_belt/belt_speed``), which its operator sets.
 
     Attributes:
-        names: of the measurements, in order. rest: what they are where all observations are zero; it fills the window
-            of an episode that is younger than the window.
+        names: of the measurements, in order. rest: measurements for observations of zero; they fill the window at the
+            start of an episode.
         offsets, scales: the observation of a measurement m is (m - offset)/scale, clipped to [-limit, limit].
-        command: name of what is commanded. command_offset, command_scale: it is offset + scale x action.
+        command: its name. command_offset, command_scale: the command is offset + scale x action.
     """
 
     names: tuple[str, ...]
@@ -57,15 +57,15 @@ class Interface:
 
     @classmethod
     def of(cls, env: SDFrictionEnv) -> "Interface":
-        """Return that of an environment.
+        """Return the interface of an environment.
 
         Raises:
-            ValueError: if it shows parameters, which nobody can measure.
+            ValueError: if it shows parameters, which cannot be measured.
         """
         task, speed = env.task, env.nominal.belt_speed
         if task.show_parameters:
-            raise ValueError("an agent that is shown parameters cannot be exported: they are no measurements")
-        assert task.x_offset is not None  # filled in by the environment, as the other scales are
+            raise ValueError("an agent that is shown parameters cannot be exported: they cannot be measured")
+        assert task.x_offset is not None  # set by the environment, like the other scales
         assert task.x_scale is not None
         assert task.v_scale is not None
         names, offsets, scales = ["x"], [task.x_offset], [task.x_scale]
@@ -102,19 +102,45 @@ def build(policy: NetworkPolicy, env: SDFrictionEnv, about: dict[str, Any] | Non
     """Return the ONNX model of an agent.
 
     Input ``measurements``: float32, shape (n, frames, k), oldest first. Outputs ``action`` and ``command``: float32,
-    shape (n, 1). ``metadata_props`` say what the columns are, how often it is to be asked, and what fills a young
+    shape (n, 1). ``metadata_props`` hold the columns' names, the control interval, and the values that fill a new
     window.
 
     Args:
-        policy: of the agent. env: that it controls. about: more for the metadata (JSON values).
+        policy: of the agent. env: that it controls. about: additional metadata (JSON values).
 
     Raises:
         ValueError: if the agent does not fit the environment.
     """
     interface = Interface.of(env)
+    if policy.observation_size != len(interface.names):
+        raise ValueError(
+            f"the agent observes {policy.observation_size} values, and the environment gives {len(interface.names)}"
+        )
+    model = helper.make_model(
+        _graph(policy, interface),
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=_IR_VERSION,
+        producer_name="sd_friction_env",
+        producer_version=sd_friction_env.__version__,
+    )
+    metadata = {
+        "units": "dimensionless: lengths over the spring's free length, times times its frequency",
+        "measurements": list(interface.names),
+        "window": f"the last {policy.frames} measurements, one for each control interval, oldest first",
+        "young_window_is_filled_with": list(interface.rest),
+        "control_interval": env.task.control_interval,
+        "sensor": env.task.sensor,
+        "command": interface.command,
+        **(about or {}),
+    }
+    texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in metadata.items()}
+    helper.set_model_props(model, texts)
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def _graph(policy: NetworkPolicy, interface: Interface) -> onnx.GraphProto:
     k = len(interface.names)
-    if policy.observation_size != k:
-        raise ValueError(f"the agent observes {policy.observation_size} values, and the environment gives {k}")
     constants: dict[str, NDArray[Any]] = {
         "offsets": np.array(interface.offsets),
         "scales": np.array(interface.scales),
@@ -135,7 +161,7 @@ def build(policy: NetworkPolicy, env: SDFrictionEnv, about: dict[str, Any] | Non
     double = add("Cast", [MEASUREMENTS], "double", to=TensorProto.DOUBLE)
     scaled = add("Div", [add("Sub", [double, "offsets"], "shifted"), "scales"], "scaled")
     clipped = add("Clip", [scaled, "low", "high"], "clipped")
-    # Agents have seen observations in single precision.
+    # Agents are trained on observations in single precision.
     single = add("Cast", [clipped], "observations", to=TensorProto.FLOAT)
     hidden = add("Reshape", [add("Cast", [single], "observed", to=TensorProto.DOUBLE), "flat"], "window")
     for i, (weights, bias) in enumerate(policy.layers):
@@ -144,44 +170,19 @@ def build(policy: NetworkPolicy, env: SDFrictionEnv, about: dict[str, Any] | Non
         hidden = add("Add", [product, f"bias_{i}"], f"sum_{i}")
         if i + 1 < len(policy.layers):
             hidden = add(_OPERATORS[policy.activation], [hidden], f"hidden_{i}")
-    if policy.output == "clip":
-        hidden = add("Clip", [hidden, "minus_one", "one"], "bounded")
-    else:
-        hidden = add("Tanh", [hidden], "bounded")
-    add("Cast", [hidden], ACTION, to=TensorProto.FLOAT)
-    # What is commanded follows from the action as it is given out.
+    operator, limits = ("Clip", ["minus_one", "one"]) if policy.output == "clip" else ("Tanh", [])
+    add("Cast", [add(operator, [hidden, *limits], "bounded")], ACTION, to=TensorProto.FLOAT)
+    # The command follows from the action in single precision, as it is returned.
     given = add("Cast", [ACTION], "given", to=TensorProto.DOUBLE)
     command = add("Add", [add("Mul", [given, "command_scale"], "change"), "command_offset"], "commanded")
     add("Cast", [command], COMMAND, to=TensorProto.FLOAT)
-    graph = helper.make_graph(
+    return helper.make_graph(
         nodes,
         "agent",
         [helper.make_tensor_value_info(MEASUREMENTS, TensorProto.FLOAT, ["n", policy.frames, k])],
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", 1]) for name in (ACTION, COMMAND)],
         [numpy_helper.from_array(value, name) for name, value in constants.items()],
     )
-    model = helper.make_model(
-        graph,
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=_IR_VERSION,
-        producer_name="sd_friction_env",
-        producer_version=sd_friction_env.__version__,
-    )
-    said = {
-        "units": "dimensionless: lengths over the spring's free length, times times its frequency",
-        "measurements": list(interface.names),
-        "window": f"the last {policy.frames} measurements, one for each control interval, oldest first",
-        "young_window_is_filled_with": list(interface.rest),
-        "control_interval": env.task.control_interval,
-        "sensor": env.task.sensor,
-        "command": interface.command,
-        **(about or {}),
-    }
-    helper.set_model_props(
-        model, {name: value if isinstance(value, str) else json.dumps(value) for name, value in said.items()}
-    )
-    onnx.checker.check_model(model, full_check=True)
-    return model
 
 
 def session(model: onnx.ModelProto | Path) -> onnxruntime.InferenceSession:
@@ -194,8 +195,8 @@ def session(model: onnx.ModelProto | Path) -> onnxruntime.InferenceSession:
 
 
 def trial_measurements(policy: NetworkPolicy, env_id: str, n: int, seed: int = 0) -> Measurements:
-    """Return windows of measurements, shape (n, frames, k): half from episodes that the agent controls, with the young
-    windows of their beginnings, half random over more than what an observation can show."""
+    """Return windows of measurements, shape (n, frames, k): half from episodes that the agent controls, with their
+    partly filled first windows, half random over more than the range of an observation."""
     env = evaluation.make_env(env_id)
     interface, rng = Interface.of(env), np.random.default_rng(seed)
     k, frames = len(interface.names), policy.frames
@@ -213,7 +214,7 @@ def trial_measurements(policy: NetworkPolicy, env_id: str, n: int, seed: int = 0
             begins, over = False, terminated or truncated
     spread = 1.2 * interface.limit * np.array(interface.scales)
     random = rng.uniform(-1.0, 1.0, (n - len(driven), frames, k)) * spread + np.array(interface.offsets)
-    # A clipped observation is seldom; most are near what is usual.
+    # Clipped observations are rare: half of the windows are in the usual range.
     random[::2] = (random[::2] - np.array(interface.offsets)) / interface.limit + np.array(interface.offsets)
     return np.concatenate([np.array(driven, np.float32).reshape(-1, frames, k), random.astype(np.float32)])
 
@@ -224,22 +225,22 @@ def worst_difference(model: onnx.ModelProto, policy: NetworkPolicy, env_id: str,
     (actions,) = session(model).run([ACTION], {MEASUREMENTS: measurements})
     windows = interface.observe(measurements)
     state = None
-    for frame in range(policy.frames):  # shown one after the other, as an episode does
+    for frame in range(policy.frames):  # one after the other, as in an episode
         expected, state = policy.predict(windows[:, frame], state, np.full(len(windows), frame == 0))
     return float(np.abs(actions - expected).max())
 
 
 def map_difference(env_id: str, n: int, seed: int = 0) -> float:
-    """Return the largest difference between what n true states of the environment are mapped to here, and what the
-    environment itself observes of them and applies to its belt or mass.
+    """Return the largest difference between the interface and the environment, over n true states: of the observations
+    made from their measurements, and of the commands applied to the belt or the mass.
 
-    The sensor's noise and delay are left out: they belong to the plant, not to the map. Nothing of the environment's
-    observations enters the measurements, so that a wrong map cannot cancel out.
+    The sensor's noise and delay are left out: they belong to the plant, not to the map. Measurements do not use the
+    environment's observations, so that an error of the map cannot cancel.
     """
     interface = Interface.of(evaluation.make_env(env_id))
     env = evaluation.make_env(env_id, {"sensor_noise": 0.0, "sensor_delay": 0})
     by_force, rng, worst, left = env.task.actuator == "force", np.random.default_rng(seed), 0.0, n
-    episodes = max(1, min(20, n))  # each of another plant, where they are drawn
+    episodes = max(1, min(20, n))  # each with another plant, where they are drawn
     for episode in range(episodes):
         observation, info = env.reset(seed=int(rng.integers(2**31)))
         relative = "belt_speed" in env.task.randomise
@@ -264,7 +265,7 @@ def map_difference(env_id: str, n: int, seed: int = 0) -> float:
 
 
 def latency(model: onnx.ModelProto, measurements: Measurements, calls: int = 5000) -> tuple[float, float]:
-    """Return median and 99th percentile of the time of one decision on one thread, in seconds."""
+    """Return median and 99th percentile of the time of one call on one thread, in seconds."""
     run = session(model).run
     singles = [measurements[i % len(measurements)][None] for i in range(calls)]
     for one in singles[:200]:

@@ -1,4 +1,4 @@
-"""A controller on a grid of plants, in chunks: on one core, several, or many machines (see :mod:`sweeps`)."""
+"""A controller evaluated on a grid of plants, in chunks: on one core, several, or many machines (see :mod:`sweeps`)."""
 
 import hashlib
 import itertools
@@ -26,11 +26,11 @@ def evaluation_grid(
     seeds: Sequence[int] = evaluation.EVALUATION_SEEDS[:10],
     plants_a_chunk: int = PLANTS_A_CHUNK,
 ) -> Table:
-    """Return how a controller does on every plant of a grid, from the same starts.
+    """Evaluate a controller on every plant of a grid, from the same starts.
 
     Args:
-        policy: to be judged; it is pickled. env_id: of one of our environments; what its tier would draw is at its
-            nominal value unless it is swept.
+        policy: to be evaluated; it is pickled. env_id: of one of our environments; parameters that its tier
+            draws are at their nominal values unless they are swept.
         over: values of each swept parameter, by name; the grid is their product, the last name the fastest.
         engine: where it runs. seeds: of the episodes on each plant. plants_a_chunk: at least 1.
 
@@ -72,8 +72,7 @@ def _chunk(chunk: tuple[Policy, str, tuple[str, ...], list[tuple[float, ...]], l
     policy, env_id, names, points, seeds = chunk
     env = evaluation.make_env(env_id)
     each = np.repeat(np.array(points), len(seeds), axis=0)
-    plants = {name: np.full(len(each), getattr(env.nominal, name)) for name in env.task.randomise}
-    options = {"parameters": plants | dict(zip(names, each.T, strict=True))}
+    options = {"parameters": evaluation.nominal_draws(env, len(each)) | dict(zip(names, each.T, strict=True))}
     episodes, passive = (
         evaluation.run_episodes(who, env_id, seeds * len(points), options=options) for who in (policy, ZeroPolicy())
     )

@@ -1,28 +1,24 @@
-"""Run folders: all that is needed to load a trained agent again, and nothing that is executed on loading.
+"""Run folders: everything that is needed to load a trained agent again; nothing is executed on loading.
 
 A finished run is a folder with::
 
-    config.json         what was trained, how, with which versions; how to build the network again; the files' digests
+    config.json         what was trained, how and with which versions; how to rebuild the network; the files' digests
     policy.pt           the best model's weights (a table of tensors; read with weights_only=True)
     policy.npz          the same actor for plain NumPy (sd_friction_env.control.policies.load_policy)
-    evaluations.csv     what each evaluation during training gave
-    checkpoints/        the last checkpoint; in an unfinished run all that is needed to go on as if nothing had
-                        happened, and its predecessor, in case it is damaged
+    evaluations.csv     the result of each evaluation during training
+    checkpoints/        the last checkpoint; in an unfinished run also its predecessor, in case the last is damaged
     tensorboard/        event files
 
-While it is being trained, the folder is called ``NAME.partial``; it gets its name, and its config.json the status
-"finished", when all else is written. So a half-written folder never looks like a finished one, whatever it is called.
-A run that was interrupted, or killed at any moment, goes on from its last checkpoint (:func:`training.train`):
-``resumed`` in config.json says after how many steps that was done, and with which versions. One process at a time works
-on a run: it holds the lock ``.NAME.lock`` beside the folder.
+During training the folder is called ``NAME.partial``. It gets its name, and its config.json the status "finished", when
+everything else is written, so that an unfinished folder never looks like a finished one. A run that was interrupted or
+killed continues from its last checkpoint (:func:`training.train`); ``resumed`` in config.json records after how many
+steps, and with which versions. One process at a time works on a run; it holds the lock ``.NAME.lock`` next to the run.
 """
 
 import contextlib
 import itertools
 import os
 import shutil
-import sys
-import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,18 +27,9 @@ import numpy as np
 from gymnasium import spaces
 
 from sd_friction_env.control.policies import NetworkPolicy, PolicyFileError, load_policy
-from sd_friction_env.storage import (
-    LockedError,
-    StoredFileError,
-    file_digest,
-    locked,
-    naming,
-    open_archive,
-    open_regular,
-    read_json,
-    sealed_archive,
-    write_json,
-)
+from sd_friction_env.learning.settings import ALGORITHMS, parse_policy_kwargs
+from sd_friction_env.learning.tensors import load_tensors
+from sd_friction_env.storage import LockedError, StoredFileError, file_digest, locked, read_json, write_json
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
@@ -52,19 +39,10 @@ KIND = "sd_friction_env run"
 CONFIG, WEIGHTS, NETWORK, EVALUATIONS = "config.json", "policy.pt", "policy.npz", "evaluations.csv"
 CHECKPOINTS, TENSORBOARD = "checkpoints", "tensorboard"
 PARTIAL = ".partial"
-ALGORITHMS = ("ppo", "sac", "td3", "tqc")
 
-_NEEDED_TO_RESUME = (
-    "algorithm",
-    "device",
-    "environment",
-    "evaluation",
-    "hyperparameters",
-    "seed",
-    "threads",
-    "versions",
-)
-_NEEDED = ("algorithm", "environment", "files", "hyperparameters", "seed", "spaces", "steps", "versions")
+_ALWAYS_STORED = ("algorithm", "environment", "hyperparameters", "seed", "versions")
+_NEEDED_TO_RESUME = (*_ALWAYS_STORED, "device", "evaluation", "threads")
+_NEEDED = (*_ALWAYS_STORED, "files", "spaces", "steps")
 
 
 class RunFolderError(ValueError):
@@ -75,7 +53,7 @@ class RunFolderError(ValueError):
 
 
 def partial_folder(folder: Path) -> Path:
-    """Return the name a run folder has while it is being written."""
+    """Return the name of a run folder during training."""
     return folder.with_name(folder.name + PARTIAL)
 
 
@@ -83,21 +61,18 @@ def check_free(folder: Path, *, force: bool = False) -> None:
     """Raise unless a run may be written to ``folder``; nothing is written or removed.
 
     Args:
-        folder: of the finished run. force: whether a run that is there already may be replaced.
+        folder: of the finished run. force: whether an existing run may be replaced.
 
     Raises:
-        RunFolderError: if the name cannot be one, something else is there, or a run is there and ``force`` not given.
+        RunFolderError: if the name is not allowed, something else has it, or a run has it and ``force`` is not given.
     """
     if not folder.name or folder.name.endswith(PARTIAL) or folder.name in (".", ".."):
         raise RunFolderError(f"run folder must have a name that does not end in {PARTIAL!r}, got {str(folder)!r}")
-    for parent in folder.parents:
-        if parent.exists():
-            if not parent.is_dir():
-                raise RunFolderError(f"run folder {str(folder)!r} cannot be made: {str(parent)!r} is a file")
-            if not os.access(parent, os.W_OK):
-                raise RunFolderError(f"run folder {str(folder)!r} cannot be made: {str(parent)!r} is not writable")
-            break
-    for place, what in ((folder, "exists"), (partial_folder(folder), "is there from an unfinished run")):
+    parent = next((parent for parent in folder.parents if parent.exists()), None)
+    if parent is not None and not (parent.is_dir() and os.access(parent, os.W_OK)):
+        what = "not writable" if parent.is_dir() else "a file"
+        raise RunFolderError(f"run folder {str(folder)!r} cannot be made: {str(parent)!r} is {what}")
+    for place, what in ((folder, "exists"), (partial_folder(folder), "exists, from an unfinished run")):
         if not place.exists() and not place.is_symlink():
             continue
         reason = _reason_to_keep(place)
@@ -108,7 +83,7 @@ def check_free(folder: Path, *, force: bool = False) -> None:
 
 
 def _reason_to_keep(place: Path) -> str:
-    """Return why removing ``place`` might remove something precious; "" if it is a run or empty."""
+    """Return why ``place`` must not be removed; "" if it is a run or empty."""
     if place.is_symlink() or not place.is_dir():
         return "it is a file or a link"
     if not any(place.iterdir()):
@@ -122,10 +97,10 @@ def _reason_to_keep(place: Path) -> str:
 
 @contextlib.contextmanager
 def only_here(folder: Path) -> Iterator[None]:
-    """Keep other processes from working on the run that is to become ``folder``.
+    """Lock the run that will become ``folder`` against other processes.
 
     Raises:
-        RunFolderError: if one does so already, naming it. OSError: if the lock cannot be written.
+        RunFolderError: if another process has locked it, naming that process. OSError: if the lock cannot be written.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -143,24 +118,30 @@ def begin(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> Pa
     """
     check_free(folder, force=force)
     partial = partial_folder(folder)
-    # Made under other names and renamed: whenever this is killed, what is called partial has its config.json.
-    fresh, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{age}{PARTIAL}") for age in ("new", "old"))
-    for left in (fresh, old):
-        shutil.rmtree(left, ignore_errors=True)
+    # Made under another name and renamed: a partial folder has its config.json even if this process is killed.
+    fresh = folder.with_name(f".{folder.name}.new{PARTIAL}")
+    shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     try:
         write_unfinished(fresh, config)
-        if partial.exists():
-            os.replace(partial, old)
-        os.replace(fresh, partial)
+        _replace_folder(fresh, partial)
     finally:
-        for place in (fresh, old):
-            shutil.rmtree(place, ignore_errors=True)
+        shutil.rmtree(fresh, ignore_errors=True)
     return partial
 
 
+def _replace_folder(source: Path, target: Path) -> None:
+    """Give a folder the name of another one, which is removed if it exists."""
+    old = target.with_name(f".{target.name}.old{PARTIAL}")
+    shutil.rmtree(old, ignore_errors=True)
+    if target.exists():
+        os.replace(target, old)
+    os.replace(source, target)
+    shutil.rmtree(old, ignore_errors=True)
+
+
 def write_unfinished(partial: Path, config: Mapping[str, Any]) -> None:
-    """Write the config.json of a run that is being trained to its partial folder."""
+    """Write the config.json of an unfinished run to its partial folder."""
     write_json(partial / CONFIG, {"kind": KIND, "format": FORMAT, "status": "unfinished", **config})
 
 
@@ -177,7 +158,7 @@ def keep_checkpoints(partial: Path, *kept: Path | None) -> None:
 
 
 def remove_leftovers(partial: Path) -> None:
-    """Remove from a partial folder the half-written files that a killed process has left."""
+    """Remove half-written files that a killed process has left in a partial folder."""
     for place in (partial, partial / CHECKPOINTS):
         for file in place.glob(f".*{PARTIAL}"):
             file.unlink()
@@ -190,59 +171,18 @@ def finish(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> N
         folder: of the finished run. config: as :func:`load_config` will return it, without ``files``.
 
     Raises:
-        RunFolderError: if something has taken the name meanwhile and ``force`` is not given.
+        RunFolderError: if something else has taken the name and ``force`` is not given.
     """
     partial = partial_folder(folder)
     files = {name: file_digest(partial / name) for name in (WEIGHTS, NETWORK, EVALUATIONS)}
     content = {"kind": KIND, "format": FORMAT, "status": "finished", **config, "files": files}
     write_json(partial / CONFIG, content)
-    if folder.exists():
-        if not force or _reason_to_keep(folder):
-            raise RunFolderError(f"{str(folder)!r} exists by now: the finished run is left in {str(partial)!r}")
-        old = folder.with_name(folder.name + ".old" + PARTIAL)
-        if old.exists():
-            shutil.rmtree(old)
-        os.replace(folder, old)
-        os.replace(partial, folder)
-        shutil.rmtree(old)
-    else:
-        os.replace(partial, folder)
+    if folder.exists() and (not force or _reason_to_keep(folder)):
+        raise RunFolderError(f"{str(folder)!r} exists: the finished run is left in {str(partial)!r}")
+    _replace_folder(partial, folder)
 
 
-class _File:
-    """A file that remembers why it could not be written: torch says only that it could not."""
-
-    def __init__(self, file: Any) -> None:
-        self.file = file
-        self.error: OSError | None = None
-
-    def write(self, data: Any) -> int:
-        try:
-            return int(self.file.write(data))
-        except OSError as error:
-            self.error = error
-            raise
-
-    def flush(self) -> None:
-        self.file.flush()
-
-
-def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
-    """Write tensors and plain values with torch.save, sealed, whole or not at all, also if the machine fails.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
-    import torch
-
-    with sealed_archive(path) as file:
-        target: Any = _File(file)
-        try:
-            torch.save(dict(content), target)
-        except RuntimeError:
-            if target.error is not None:
-                raise target.error from None
-            raise
+# Spaces ---------------------------------------------------------------------------------------------------------------
 
 
 def describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
@@ -266,7 +206,7 @@ def described_space(description: Any) -> spaces.Box:
     """Return the Box that :func:`describe_space` described.
 
     Raises:
-        ValueError: if it describes none.
+        ValueError: if it is not the description of one.
     """
     try:
         if description["type"] != "Box" or description["dtype"] != "float32":
@@ -284,7 +224,7 @@ def described_space(description: Any) -> spaces.Box:
 
 
 def load_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the configuration of a finished run, after checking that its files are those that were written.
+    """Return the configuration of a finished run, after checking the digests of its files.
 
     Raises:
         RunFolderError: if the folder is missing, unfinished, damaged, or of another kind or format.
@@ -296,19 +236,24 @@ def load_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
         raise RunFolderError(f"there is no run folder {name!r}{hint}")
     config = _read_config(place)
     if config.get("status") != "finished":
-        raise RunFolderError(f"{name!r} is half-written: its training has not finished")
-    missing = [key for key in _NEEDED if key not in config]
-    if missing or config["algorithm"] not in ALGORITHMS or not isinstance(config["files"], dict):
-        what = f"lacks {missing[0]!r}" if missing else "holds values that cannot be"
-        raise RunFolderError(f"{name!r} is damaged: its {CONFIG} {what}")
+        raise RunFolderError(f"{name!r} is unfinished: its training has not ended")
+    _check_keys(config, _NEEDED, name)
+    if config["algorithm"] not in ALGORITHMS or not isinstance(config["files"], dict):
+        raise RunFolderError(f"{name!r} is damaged: its {CONFIG} holds values that are not allowed")
     for file in (WEIGHTS, NETWORK, EVALUATIONS):
         try:
             digest = file_digest(place / file)
         except (OSError, StoredFileError):
             raise RunFolderError(f"{name!r} is damaged: {file} is missing or cannot be read") from None
         if digest != config["files"].get(file):
-            raise RunFolderError(f"{name!r} is damaged: {file} is not the file that {CONFIG} speaks of")
+            raise RunFolderError(f"{name!r} is damaged: {file} differs from its digest in {CONFIG}")
     return config
+
+
+def _check_keys(config: Mapping[str, Any], needed: tuple[str, ...], name: str) -> None:
+    missing = [key for key in needed if key not in config]
+    if missing:
+        raise RunFolderError(f"{name!r} is damaged: its {CONFIG} lacks {missing[0]!r}")
 
 
 def _read_config(place: Path) -> dict[str, Any]:
@@ -325,10 +270,10 @@ def _read_config(place: Path) -> dict[str, Any]:
 
 
 def load_unfinished(folder: Path, *, force: bool = False) -> dict[str, Any]:
-    """Return the configuration of the unfinished run that is to become ``folder``; nothing is written.
+    """Return the configuration of the unfinished run that will become ``folder``; nothing is written.
 
     Args:
-        folder: of the finished run. force: whether a finished run that is there too may be replaced in the end.
+        folder: of the finished run. force: whether an existing finished run may be replaced in the end.
 
     Raises:
         RunFolderError: if there is none, it is finished, damaged, of another kind or format, or its name is taken.
@@ -340,11 +285,9 @@ def load_unfinished(folder: Path, *, force: bool = False) -> dict[str, Any]:
             raise RunFolderError(f"{str(folder)!r} is finished: there is nothing to resume")
         raise RunFolderError(f"there is nothing to resume: no {str(partial)!r}")
     if folder.exists() and not force:
-        raise RunFolderError(f"{str(folder)!r} exists: resume with --force to let {str(partial)!r} take its place")
+        raise RunFolderError(f"{str(folder)!r} exists: resume with --force to let {str(partial)!r} replace it")
     config = _read_config(partial)
-    missing = [key for key in _NEEDED_TO_RESUME if key not in config]
-    if missing:
-        raise RunFolderError(f"{str(partial)!r} is damaged: its {CONFIG} lacks {missing[0]!r}")
+    _check_keys(config, _NEEDED_TO_RESUME, str(partial))
     return config
 
 
@@ -367,71 +310,44 @@ def load_torch_policy(folder: str | os.PathLike[str], device: str = "cpu") -> "B
     Its observations are those of the training environment: a stack of ``environment["frame_stack"]`` of them.
 
     Raises:
-        RunFolderError: as :func:`load_config`, or if policy.pt is more than a table of tensors, or another network's.
+        RunFolderError: as :func:`load_config`, or if policy.pt is not a table of tensors, or of another network.
     """
-    from sd_friction_env.learning.training import build_policy
-
     config = load_config(folder)
-    weights = load_tensors(Path(folder) / WEIGHTS)
     try:
-        policy_kwargs = config["hyperparameters"].get("policy_kwargs", {})
-        _check_size(policy_kwargs, weights)
-        observation_space, action_space = (
-            described_space(config["spaces"][kind]) for kind in ("observation", "action")
-        )
-        policy = build_policy(config["algorithm"], observation_space, action_space, policy_kwargs)
-        for name, tensor in policy.state_dict().items():
-            if name in weights and weights[name].dtype != tensor.dtype:
-                raise ValueError(f"{name} in {WEIGHTS} is {weights[name].dtype}, not {tensor.dtype}")
-            if name in weights and not weights[name].isfinite().all():
-                raise ValueError(f"{name} in {WEIGHTS} has entries that are not finite")
+        return _filled_policy(config, load_tensors(Path(folder) / WEIGHTS)).to(device)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunFolderError(f"{os.fspath(folder)!r} is damaged: {error}") from None
+
+
+def _filled_policy(config: Mapping[str, Any], weights: Mapping[str, Any]) -> "BasePolicy":
+    from sd_friction_env.learning import networks
+
+    policy_kwargs = parse_policy_kwargs(config["hyperparameters"].get("policy_kwargs", {}))
+    _check_size(policy_kwargs, weights)
+    observation_space, action_space = (described_space(config["spaces"][kind]) for kind in ("observation", "action"))
+    policy = networks.build_policy(config["algorithm"], observation_space, action_space, policy_kwargs)
+    for name, tensor in policy.state_dict().items():
+        if name in weights and weights[name].dtype != tensor.dtype:
+            raise ValueError(f"{name} in {WEIGHTS} is {weights[name].dtype}, not {tensor.dtype}")
+        if name in weights and not weights[name].isfinite().all():
+            raise ValueError(f"{name} in {WEIGHTS} has entries that are not finite")
     try:
-        policy.load_state_dict(weights, strict=True)
+        policy.load_state_dict(dict(weights), strict=True)
     except (RuntimeError, TypeError, AttributeError) as error:
         reason = str(error).partition("\n")[0]
-        raise RunFolderError(f"{os.fspath(folder)!r} is damaged: {WEIGHTS} does not fit {CONFIG} ({reason})") from None
+        raise ValueError(f"{WEIGHTS} does not fit {CONFIG} ({reason})") from None
     policy.set_training_mode(False)
-    return policy.to(device)
+    return policy
 
 
-def _check_size(policy_kwargs: Any, weights: Mapping[str, Any]) -> None:
-    """Raise if a policy would have more weights than there are: it is then not even built."""
-    from sd_friction_env.learning.training import parse_policy_kwargs
-
-    kwargs = parse_policy_kwargs(policy_kwargs)
-    nets = kwargs.get("net_arch", [])
-    least = kwargs.get("n_critics", 1) * sum(
+def _check_size(policy_kwargs: Mapping[str, Any], weights: Mapping[str, Any]) -> None:
+    """Raise if a policy would have more weights than are stored, before it is built."""
+    nets = policy_kwargs.get("net_arch", [])
+    least = policy_kwargs.get("n_critics", 1) * sum(
         before * after
         for widths in (nets.values() if isinstance(nets, dict) else [nets])
-        for before, after in itertools.pairwise([1, *widths, kwargs.get("n_quantiles", 1)])
+        for before, after in itertools.pairwise([1, *widths, policy_kwargs.get("n_quantiles", 1)])
     )
-    there = sum(tensor.numel() for tensor in weights.values())
-    if least > there:
-        raise ValueError(f"{WEIGHTS} does not fit {CONFIG}: it has {there:,} weights, and {least:,} or more are needed")
-
-
-def load_tensors(path: Path, *, sealed: bool = False) -> dict[str, Any]:
-    """Return what :func:`save_tensors` wrote; a file that asks for code to be run is refused.
-
-    Args:
-        sealed: whether a file without a seal is refused.
-
-    Raises:
-        RunFolderError: if it is damaged, or anything but a table of tensors and plain values.
-    """
-    import torch
-
-    try:
-        with naming(path), open_regular(path, sys.maxsize) as file:
-            with open_archive(file, sealed=sealed, compressed=False):
-                file.seek(0)
-            with warnings.catch_warnings():
-                warnings.simplefilter("error")  # torch only warns of pickles that it did not write
-                content = torch.load(file, map_location="cpu", weights_only=True)
-    except (OSError, StoredFileError) as error:
-        raise RunFolderError(f"{error}: it is not a table of tensors, or is damaged") from None
-    if not isinstance(content, dict):
-        raise RunFolderError(f"{str(path)!r} is not a table of tensors: refused")
-    return content
+    stored = sum(tensor.numel() for tensor in weights.values())
+    if least > stored:
+        raise ValueError(f"{WEIGHTS} does not fit {CONFIG}: it has {stored:,} weights, at least {least:,} are needed")

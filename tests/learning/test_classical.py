@@ -18,7 +18,7 @@ import pytest
 from sd_friction_env import ENVIRONMENT_IDS, equilibria, storage
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import ConstantPolicy, LinearFeedback, VelocityFeedback
-from sd_friction_env.learning import classical, evaluation
+from sd_friction_env.learning import classical, evaluation, scores
 from sd_friction_env.physics import theory
 
 ROOT = Path(__file__).parents[2]
@@ -149,7 +149,7 @@ def test_tuned_feedback_is_near_the_optimum_on_force_and_every_controller_is_bet
         score = {}
         for name, policy in classical.classical_controllers(env_id).items():
             table = evaluation.evaluate(policy, env_id, seeds, passive=passive)
-            score[name] = evaluation.score(table["return"], without, best)
+            score[name] = scores.score(table["return"], without, best)
             assert 0.0 < score[name] < 1.0, (env_id, name)
         assert max(score.values()) > (0.99 if env_id in (FORCE, "SDFriction/ForceRandomised-v0") else 0.5)
 

@@ -13,8 +13,9 @@ import scipy.stats
 from sd_friction_env import OscillatorParameters, Table, limit_cycle
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import ConstantPolicy, NetworkPolicy, VelocityFeedback, ZeroPolicy
-from sd_friction_env.learning import classical, evaluation, optimal
-from sd_friction_env.learning.evaluation import Episodes, evaluate, metrics, run_episodes, score, summarise
+from sd_friction_env.learning import classical, evaluation, optimal, scores
+from sd_friction_env.learning.evaluation import Episodes, evaluate, metrics, run_episodes, summarise
+from sd_friction_env.learning.scores import score
 
 STEPS = 40
 FORCE, BELT = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0"
@@ -149,7 +150,7 @@ def test_the_interval_of_a_score_is_the_paired_bootstrap():
     passive = rng.normal(-500.0, 30.0, 60)
     optimal = -40.0 + 0.2 * (passive + 500.0)
     returns = optimal - rng.gamma(2.0, 20.0, 60)
-    low, high = evaluation.score_interval(returns, passive, optimal, resamples=20_000)
+    low, high = scores.score_interval(returns, passive, optimal, resamples=20_000)
 
     def statistic(mine, without, best, axis):
         base = without.mean(axis=axis)
@@ -160,43 +161,43 @@ def test_the_interval_of_a_score_is_the_paired_bootstrap():
     ).confidence_interval
     assert (low, high) == pytest.approx((oracle.low, oracle.high), abs=0.03 * (high - low))
     assert low < score(returns, passive, optimal) < high
-    assert evaluation.score_interval(returns, passive, optimal, seed=3) == evaluation.score_interval(
+    assert scores.score_interval(returns, passive, optimal, seed=3) == scores.score_interval(
         returns, passive, optimal, seed=3
     )
     # what is always halfway is so in every resample; one episode tells nothing of the next
-    assert evaluation.score_interval(0.5 * (passive + optimal), passive, optimal) == pytest.approx((0.5, 0.5))
-    assert np.isnan(evaluation.score_interval([2.0], [1.0], [3.0])).all()
+    assert scores.score_interval(0.5 * (passive + optimal), passive, optimal) == pytest.approx((0.5, 0.5))
+    assert np.isnan(scores.score_interval([2.0], [1.0], [3.0])).all()
 
 
 def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
-    assert evaluation.interquartile_mean([-100.0, 1.0, 2.0, 3.0, 1000.0]) == 2.0
-    assert evaluation.interquartile_mean(np.array([[0.0, 1.0], [5.0, 90.0]])) == 3.0
-    assert evaluation.interquartile_mean([4.0, 8.0]) == 6.0
+    assert scores.interquartile_mean([-100.0, 1.0, 2.0, 3.0, 1000.0]) == 2.0
+    assert scores.interquartile_mean(np.array([[0.0, 1.0], [5.0, 90.0]])) == 3.0
+    assert scores.interquartile_mean([4.0, 8.0]) == 6.0
 
 
 def test_the_interval_over_runs_is_the_bootstrap_over_all_resamples():
     runs = [0.1, 0.5, 0.6]
     every = [np.mean(drawn) for drawn in itertools.product(runs, repeat=3)]  # of three, none is cut off
-    low, high = evaluation.run_interval([runs], resamples=40_000)
+    low, high = scores.run_interval([runs], resamples=40_000)
     for end, share in ((low, 0.025), (high, 0.975)):
         assert end == pytest.approx(np.quantile(every, share, method="inverted_cdf"))
-    assert np.isnan(evaluation.run_interval([[0.3]])).all()
+    assert np.isnan(scores.run_interval([[0.3]])).all()
     with pytest.raises(ValueError, match="scores must be"):
-        evaluation.run_interval([[0.3], []])
+        scores.run_interval([[0.3], []])
 
 
 def test_runs_are_resampled_within_their_task():
     # Were they mixed, the share of ones would vary between resamples.
-    assert evaluation.run_interval([[0.0] * 4, [1.0] * 4]) == (0.5, 0.5)
-    assert evaluation.run_interval([[0.0, 1.0] * 4]) != (0.5, 0.5)
+    assert scores.run_interval([[0.0] * 4, [1.0] * 4]) == (0.5, 0.5)
+    assert scores.run_interval([[0.0, 1.0] * 4]) != (0.5, 0.5)
 
 
 def test_the_interval_of_a_share_is_wilsons():
     z = scipy.stats.norm.ppf(0.975)
     hits, n = 7, 20
     centre, half = (hits + z * z / 2) / (n + z * z), z / (n + z * z) * np.sqrt(hits * (n - hits) / n + z * z / 4)
-    assert evaluation.share_interval(hits, n) == pytest.approx((centre - half, centre + half))
-    assert evaluation.share_interval(100, 100)[0] == pytest.approx(100 / (100 + z * z))
+    assert scores.share_interval(hits, n) == pytest.approx((centre - half, centre + half))
+    assert scores.share_interval(100, 100)[0] == pytest.approx(100 / (100 + z * z))
 
 
 def test_each_episode_may_have_parameters_of_its_own():

@@ -12,7 +12,7 @@ import pytest
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import PolicyFileError
 from sd_friction_env.environments.single import SDFrictionEnv
-from sd_friction_env.learning import evaluation, optimal
+from sd_friction_env.learning import evaluation, optimal, scores
 from sd_friction_env.learning.evaluation import EVALUATION_SEEDS
 from sd_friction_env.learning.optimal import RANDOMISED, SENSED, TASKS, OptimalPolicy
 
@@ -180,7 +180,7 @@ def test_extrapolating_backward_induction_changes_nothing(monkeypatch):
     taken = []
     stopped = optimal.value_iteration(problem, grid, tried, lambda steps, label: count(taken, steps, label))
     assert taken.count("backward induction") < problem.steps
-    monkeypatch.setattr(optimal, "SPAN", 0.0)
+    monkeypatch.setattr(optimal.grid, "SPAN", 0.0)
     full = optimal.value_iteration(problem, grid, tried)
     np.testing.assert_allclose(stopped.whole, full.whole, rtol=0.0, atol=5e-4)
     np.testing.assert_allclose(stopped.after_first, full.after_first, rtol=0.0, atol=5e-4)
@@ -271,7 +271,8 @@ def damaged_copies(path):
 @pytest.fixture
 def unchanging(monkeypatch):
     """Take every fingerprint for that of now: only what reading refuses is refused, and it is quick."""
-    monkeypatch.setattr(optimal, "check_fingerprint", lambda *arguments: None)
+    for module in (optimal.stored, optimal.policy):
+        monkeypatch.setattr(module, "check_fingerprint", lambda *arguments: None)
 
 
 def test_no_damage_to_a_value_function_comes_out_as_anything_but_a_policy_file_error(tmp_path, unchanging):
@@ -372,7 +373,7 @@ def test_policy_suppresses_and_comes_close_to_the_optimum(env_id, least):
     table = evaluation.evaluate(OptimalPolicy.load(env_id), env_id, seeds)
     assert table["suppressed"].all()
     passive = np.nansum(evaluation.passive_episodes(env_id, seeds).reward, axis=1)
-    assert least < evaluation.score(table["return"], passive, optimal.optimal_returns(env_id, seeds)) < 1.0
+    assert least < scores.score(table["return"], passive, optimal.optimal_returns(env_id, seeds)) < 1.0
 
 
 @pytest.mark.parametrize(("env_id", "sizes"), [(TASKS["force"], (31, 31)), (TASKS["belt"], (21, 31, 5))])
@@ -418,7 +419,7 @@ def test_value_functions_that_are_missing_damaged_or_of_another_environment_are_
     with pytest.raises(RuntimeError, match=r"parameters beta: 0\.06 -> 0\.05"):
         OptimalPolicy.load(TASKS["force"], tmp_path)
     path.write_bytes(b"no archive")
-    with pytest.raises(PolicyFileError, match="no value function"):
+    with pytest.raises(PolicyFileError, match="not a value function"):
         OptimalPolicy.load(TASKS["force"], tmp_path)
     problem = optimal.make_problem(RANDOMISED["force"], [0])
     grid = optimal.make_grid(problem, (5, 5))
@@ -468,7 +469,7 @@ def test_stopping_stores_nothing_and_says_so(monkeypatch, tmp_path, capsys):
     def stop(*arguments, **more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(optimal, "best_of", stop)
+    monkeypatch.setattr(optimal.study, "best_of", stop)
     small = ["--task", "force", "--draws", "1", "--grid", "9x9", "--beam", "0", "--rounds", "0"]
     assert main(["optimum", *small, "--out", str(tmp_path)]) == 130
     assert capsys.readouterr().err.endswith("sd-friction optimum: interrupted; nothing was stored\n")

@@ -17,6 +17,7 @@ from sd_friction_env.cli.options import TASKS, TIERS, environment_id
 from sd_friction_env.control.policies import ConstantPolicy, NetworkPolicy, VelocityFeedback, ZeroPolicy
 from sd_friction_env.learning import classical, evaluation, optimal, report, runs
 from sd_friction_env.learning.report import ENV_IDS, QUICK, Effort, Replay, Report
+from sd_friction_env.learning.report.agents import LEARNING
 from sd_friction_env.storage import file_digest, write_json
 
 ROOT = Path(__file__).parents[2]
@@ -42,7 +43,7 @@ def make_run(folder, name, gain=-3.0, rows=((100, 1.0, -400.0, 0.0), (300, 3.0, 
     NetworkPolicy(((weights, np.zeros(1)),)).save(partial / runs.NETWORK)
     (partial / runs.WEIGHTS).write_bytes(b"not read here")
     columns = zip(*rows, strict=True)
-    Table(dict(zip(report._LEARNING, columns, strict=True))).to_csv(partial / runs.EVALUATIONS)
+    Table(dict(zip(LEARNING, columns, strict=True))).to_csv(partial / runs.EVALUATIONS)
     runs.finish(folder / name, config | changes)
     return folder / name
 
@@ -79,7 +80,7 @@ def test_a_run_that_is_not_what_its_name_says_or_is_damaged_is_refused(tmp_path)
         report.find_agents(other.parent)
     damaged = make_run(tmp_path / "b", "force-nominal-ppo-0")
     (damaged / runs.EVALUATIONS).write_text("steps,seconds\n1,2\n")
-    with pytest.raises(runs.RunFolderError, match=r"evaluations\.csv is not the file that config\.json speaks of"):
+    with pytest.raises(runs.RunFolderError, match=r"evaluations\.csv differs from its digest in config\.json"):
         report.find_agents(damaged.parent)
     (damaged / runs.EVALUATIONS).unlink()
     with pytest.raises(runs.RunFolderError, match=r"evaluations\.csv is missing or cannot be read"):
@@ -89,7 +90,7 @@ def test_a_run_that_is_not_what_its_name_says_or_is_damaged_is_refused(tmp_path)
     config = json.loads((strange / runs.CONFIG).read_text())
     config["files"][runs.EVALUATIONS] = file_digest(strange / runs.EVALUATIONS)
     write_json(strange / runs.CONFIG, config)
-    with pytest.raises(runs.RunFolderError, match="must have the columns"):
+    with pytest.raises(runs.RunFolderError, match="must have columns of numbers"):
         report.find_agents(strange.parent)
     (damaged / runs.NETWORK).write_bytes(b"x")
     with pytest.raises(runs.RunFolderError, match="damaged"):

@@ -17,7 +17,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sd_friction_env import Table, storage
 from sd_friction_env.cli.main import main
-from sd_friction_env.learning import runs, training
+from sd_friction_env.learning import checkpoints, runs, tensors, training
+from sd_friction_env.learning.plan import make_plan
 
 ROOT = Path(__file__).parents[2]
 FORCE, SENSED = "SDFriction/Force-v0", "SDFriction/BeltSpeedSensed-v0"
@@ -32,7 +33,7 @@ OVERRIDES = {
 def tiny_plan(algorithm="ppo", env_id=FORCE, **changes):
     arguments = {"timesteps": 600, "envs": 4, "eval_freq": 128, "eval_episodes": 2, "seed": 7} | changes
     overrides = OVERRIDES[algorithm] | arguments.pop("overrides", {})
-    return training.make_plan(env_id, algorithm, env_kwargs={"episode_steps": 40}, overrides=overrides, **arguments)
+    return make_plan(env_id, algorithm, env_kwargs={"episode_steps": 40}, overrides=overrides, **arguments)
 
 
 def stop_after(calls):
@@ -78,8 +79,8 @@ def content(folder):
         if tag not in ("time/fps", "eval/seconds")
     }
     return {
-        "checkpoint": plain(runs.load_tensors(runs.checkpoints(folder)[0])),
-        "best": plain(runs.load_tensors(folder / "policy.pt")),
+        "checkpoint": plain(tensors.load_tensors(runs.checkpoints(folder)[0])),
+        "best": plain(tensors.load_tensors(folder / "policy.pt")),
         "table": {name: values.tolist() for name, values in table.items() if name != "seconds"},
         "steps": config["steps"],
         "scalars": scalars,
@@ -160,13 +161,13 @@ def test_a_replay_buffer_is_written_as_far_as_it_is_filled_and_not_after_the_end
     plan = tiny_plan("sac", overrides={"buffer_size": 10**7})
     partial = stopped(tmp_path / "run", plan)
     checkpoint, _ = runs.checkpoints(partial)
-    saved = runs.load_tensors(checkpoint)
+    saved = tensors.load_tensors(checkpoint)
     assert len(saved["replay"]["arrays"]["actions"]) == saved["steps"] // 4
     assert checkpoint.stat().st_size < 500_000
     (partial / "checkpoints" / ".step_000000000999.pt.1.partial").write_bytes(b"half")
     training.train(plan, tmp_path / "run", resume=True, progress=False)
     (checkpoint,) = (tmp_path / "run" / "checkpoints").iterdir()
-    assert runs.load_tensors(checkpoint)["replay"] is None
+    assert tensors.load_tensors(checkpoint)["replay"] is None
 
 
 # kill -9 --------------------------------------------------------------------------------------------------------------
@@ -361,7 +362,7 @@ def cut_short(path, length):
 
 
 def resealed(path, saved):
-    runs.save_tensors(path, saved)
+    tensors.save_tensors(path, saved)
 
 
 DAMAGES = {
@@ -385,11 +386,11 @@ def test_a_damaged_checkpoint_is_named_and_its_predecessor_is_resumed_from(damag
     last, before = runs.checkpoints(partial)
     DAMAGES[damage](last)
     with pytest.warns(UserWarning, match=rf"{last.name}.*resumed from .*{before.name}"):
-        path, saved = training._last_whole_checkpoint([last, before])
+        path, saved = checkpoints.last_whole_checkpoint([last, before])
     assert (path, saved["steps"]) == (before, 128)
     DAMAGES[damage](before)
     with pytest.raises(runs.RunFolderError, match=rf"no checkpoint can be used .*{last.name}.*{before.name}.*--force"):
-        training._last_whole_checkpoint([last, before])
+        checkpoints.last_whole_checkpoint([last, before])
 
 
 def test_no_flipped_bit_and_no_cut_of_a_checkpoint_goes_unnoticed(partial):
@@ -398,15 +399,15 @@ def test_no_flipped_bit_and_no_cut_of_a_checkpoint_goes_unnoticed(partial):
     places = rng.choice(8 * len(good), 100, replace=False).tolist()
     for place in places:
         flip(path, place)
-        with pytest.raises(runs.RunFolderError, match=path.name):
-            runs.load_tensors(path, sealed=True)
+        with pytest.raises(storage.StoredFileError, match=path.name):
+            tensors.load_tensors(path, sealed=True)
         path.write_bytes(good)
     for length in rng.choice(len(good), 20, replace=False).tolist():
         cut_short(path, length)
-        with pytest.raises(runs.RunFolderError, match=path.name):
-            runs.load_tensors(path, sealed=True)
+        with pytest.raises(storage.StoredFileError, match=path.name):
+            tensors.load_tensors(path, sealed=True)
         path.write_bytes(good)
-    assert runs.load_tensors(path, sealed=True)["steps"] == 256
+    assert tensors.load_tensors(path, sealed=True)["steps"] == 256
 
 
 @pytest.mark.filterwarnings("always")
@@ -424,12 +425,12 @@ def test_a_run_resumed_from_the_predecessor_ends_as_one_that_was_not_damaged(who
 
 def other_plan(partial):
     for path, other in zip(runs.checkpoints(partial), ("a", "b"), strict=True):
-        saved = runs.load_tensors(path)
+        saved = tensors.load_tensors(path)
         resealed(path, saved | {"plan": other})
 
 
 def other_shapes(partial):
-    saved = runs.load_tensors(runs.checkpoints(partial)[0])
+    saved = tensors.load_tensors(runs.checkpoints(partial)[0])
     saved["environments"]["state"] = saved["environments"]["state"][:, :2]
     resealed(runs.checkpoints(partial)[0], saved)
 
@@ -473,7 +474,7 @@ def all_damaged(partial):
         (other_format, "has format 1"),
         (other_runs_checkpoint, "damaged or of another run: it was written with another configuration"),
         (edited_config, "config.json': damaged, or changed since it was written"),
-        (edited_and_resealed_config, "gamma must be a number in [0, 1], got 7"),
+        (edited_and_resealed_config, "gamma must be a finite number in [0, 1], got 7"),
         (other_runs_config, "damaged or of another run: it was written with another configuration"),
         (all_damaged, "no checkpoint can be used"),
     ],
@@ -489,9 +490,9 @@ def test_what_cannot_be_resumed_is_one_clear_error_and_nothing_is_written(damage
 # Writes fail from a checkpoint on as on a full disk: the files written until then stay, later ones hit the limit.
 FULL = """
 import errno, resource, sys
-from sd_friction_env.learning import runs
+from sd_friction_env.learning import checkpoints, runs
 
-save, count = runs.save_tensors, 0
+save, count = checkpoints.save_tensors, 0
 
 def limited(path, content):
     global count
@@ -501,7 +502,7 @@ def limited(path, content):
             resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
     save(path, content)
 
-runs.save_tensors = limited
+checkpoints.save_tensors = limited
 from sd_friction_env.cli.main import main
 sys.exit(main(["train", *sys.argv[2:]]))
 """
@@ -518,7 +519,7 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(whole, room, tmp_
     assert "Traceback" not in done.stderr
     assert done.stderr.count("\n") == 1
     (checkpoint,) = (tmp_path / "run.partial" / "checkpoints").iterdir()
-    assert runs.load_tensors(checkpoint, sealed=True)["steps"] == 128
+    assert tensors.load_tensors(checkpoint, sealed=True)["steps"] == 128
     assert main(["train", "--run-folder", str(tmp_path / "run"), "--resume", "--no-progress"]) == 0
     assert content(tmp_path / "run") == whole
 

@@ -4,6 +4,7 @@ import ast
 import contextlib
 import dataclasses
 import hashlib
+import inspect
 import json
 import pickle
 import signal
@@ -23,7 +24,8 @@ from sd_friction_env import ENVIRONMENT_IDS, Table, storage
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import load_policy
 from sd_friction_env.environments.wrappers import ScaledReward
-from sd_friction_env.learning import evaluation, runs, training
+from sd_friction_env.learning import evaluation, models, networks, runs, settings, tensors, training
+from sd_friction_env.learning.plan import make_plan, training_seed
 
 ROOT = Path(__file__).parents[2]
 FORCE, BELT = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0"
@@ -39,7 +41,7 @@ TINY = {
 def tiny_plan(algorithm="ppo", env_id=FORCE, seed=0, **arguments):
     arguments = {"timesteps": 256, "envs": 4, "eval_freq": 128, "eval_episodes": 2, "env_kwargs": SHORT} | arguments
     overrides = TINY[algorithm] | arguments.pop("overrides", {})
-    return training.make_plan(env_id, algorithm, overrides=overrides, seed=seed, **arguments)
+    return make_plan(env_id, algorithm, overrides=overrides, seed=seed, **arguments)
 
 
 def tiny_command(folder, *more, algorithm="ppo"):
@@ -170,7 +172,7 @@ def test_training_leaves_torchs_threads_as_they_were(tmp_path):
     assert torch.get_num_threads() == before
 
 
-# Folders that are in the way, half-written or harmful -----------------------------------------------------------------
+# Folders that are in the way, unfinished or harmful -------------------------------------------------------------------
 
 
 def test_an_existing_run_is_refused_unless_forced(copied):
@@ -204,13 +206,13 @@ def test_a_run_that_was_stopped_is_never_taken_for_a_finished_one(tmp_path):
         training.train(plan, tmp_path / "run", progress=False, should_stop=lambda: next(calls) >= 39)
     partial = tmp_path / "run.partial"
     assert [path.name for path in tmp_path.iterdir()] == ["run.partial"]
-    assert runs.load_tensors(stop.value.checkpoint)["steps"] == 256
+    assert tensors.load_tensors(stop.value.checkpoint)["steps"] == 256
     with pytest.raises(runs.RunFolderError, match="did not finish"):
         runs.load_config(tmp_path / "run")
-    with pytest.raises(runs.RunFolderError, match="half-written"):
+    with pytest.raises(runs.RunFolderError, match="is unfinished"):
         runs.load_config(partial)
     partial.rename(tmp_path / "looks_finished")
-    with pytest.raises(runs.RunFolderError, match="half-written"):
+    with pytest.raises(runs.RunFolderError, match="is unfinished"):
         runs.load_network(tmp_path / "looks_finished")
     (tmp_path / "looks_finished").rename(partial)
     with pytest.raises(runs.RunFolderError, match="unfinished run"):
@@ -240,8 +242,8 @@ def test_damaged_folders_are_refused(copied, tmp_path):
     for changes, message in (
         ({"format": 99}, "format 99"),
         ({"kind": "other"}, "not a run folder of"),
-        ({"algorithm": "dqn"}, "values that cannot be"),
-        ({"status": "unfinished"}, "half-written"),
+        ({"algorithm": "dqn"}, "values that are not allowed"),
+        ({"status": "unfinished"}, "is unfinished"),
     ):
         damage_config(copied, **changes)
         with pytest.raises(runs.RunFolderError, match=message):
@@ -266,7 +268,7 @@ def test_weights_that_are_no_finite_numbers_of_their_type_are_refused(damage, co
 
 
 def test_a_network_larger_than_its_weights_is_not_even_built(copied, monkeypatch):
-    monkeypatch.setattr(training, "build_policy", None)
+    monkeypatch.setattr(networks, "build_policy", None)
     kwargs = {"net_arch": [4096, 4096]}
     damage_config(copied, hyperparameters={"policy_kwargs": kwargs})
     with pytest.raises(runs.RunFolderError, match=r"policy\.pt does not fit config\.json: it has .* weights"):
@@ -289,7 +291,7 @@ def test_weights_that_do_not_fit_are_refused(copied):
         runs.load_torch_policy(copied)
     config["hyperparameters"]["policy_kwargs"]["activation_fn"] = "os.system"
     storage.write_json(copied / "config.json", config)
-    with pytest.raises(runs.RunFolderError, match="activation_fn must be one of Tanh, ReLU"):
+    with pytest.raises(runs.RunFolderError, match="activation_fn must be one of 'Tanh', 'ReLU'"):
         runs.load_torch_policy(copied)
 
 
@@ -317,10 +319,8 @@ def test_a_pickle_in_place_of_the_weights_is_refused_and_never_run(copied, tmp_p
 
 
 def test_no_code_here_unpickles_or_evaluates():
-    for path in [
-        *(ROOT / "sd_friction_env" / "learning").glob("*.py"),
-        *(ROOT / "sd_friction_env" / "cli").glob("*.py"),
-    ]:
+    programs = (ROOT / "sd_friction_env" / "cli").glob("*.py")
+    for path in [*(ROOT / "sd_friction_env/learning").rglob("*.py"), *programs]:
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.Call):
                 continue
@@ -351,7 +351,7 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
     last = max(checkpoints.glob("step_*.pt"))
     assert str(last) in errors
     assert f"--run-folder {tmp_path / 'run'} --resume" in errors
-    parameters = runs.load_tensors(last)["parameters"]
+    parameters = tensors.load_tensors(last)["parameters"]
     assert {"policy", "policy.optimizer"} <= set(parameters)
 
 
@@ -371,17 +371,17 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
         (["--eval-episodes", "101"], "eval-episodes must be a whole number in [1, 100], got 101"),
         (["--threads", "0"], "threads must be"),
         (["--device", "abacus"], "device must be one of cpu, auto"),
-        (["--set", "gamma=1.5"], "gamma must be a number in [0, 1], got 1.5"),
-        (["--set", "gamma=.nan"], "gamma must be a number in [0, 1], got nan"),
+        (["--set", "gamma=1.5"], "gamma must be a finite number in [0, 1], got 1.5"),
+        (["--set", "gamma=.nan"], "gamma must be a finite number in [0, 1], got nan"),
         (["--set", "gama=0.9"], "no hyperparameter 'gama'"),
         (["--set", "gamma"], "--set must be NAME=VALUE"),
         (["--set", "tau=0.1"], "ppo has no hyperparameter 'tau'"),
         (["--set", "learning_rate=exp_1"], "learning_rate must be"),
-        (["--set", "policy=CnnPolicy"], "policy must be one of MlpPolicy, got 'CnnPolicy'"),
+        (["--set", "policy=CnnPolicy"], "policy must be one of 'MlpPolicy', got 'CnnPolicy'"),
         (["--set", "env_wrapper=os.system"], "env_wrapper must be"),
         (["--set", "policy_kwargs=dict(net_arch=open('x'))"], "policy_kwargs may hold literals"),
         (["--set", "policy_kwargs=dict(net_arch=[0])"], "a width in net_arch must be"),
-        (["--set", "policy_kwargs=dict(activation_fn=nn.Module)"], "activation_fn must be one of Tanh, ReLU"),
+        (["--set", "policy_kwargs=dict(activation_fn=nn.Module)"], "activation_fn must be one of 'Tanh', 'ReLU'"),
         (["--env-arg", "w_effort=-1"], "w_effort must be a finite number in [0, 1e+06], got -1"),
         (["--env-arg", "colour=red"], "unexpected keyword argument 'colour'"),
         (["--hyperparameters", "gone.yml"], "cannot be read from 'gone.yml'"),
@@ -389,7 +389,7 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_exits_with_130(tmp_path):
         (["--hyperparameters", str(ROOT)], "must be a file; it is a folder"),
         (["--set", f"gamma={'9' * 5000}"], "a whole number of 5000 digits; at most 40 are read"),
         (["--set", "gamma=" + "[" * 5000], "5,000 brackets lie in one another"),
-        (["--set", "gamma={a: &a [1], b: [*a, *a]}"], "gamma must be a number in [0, 1]"),
+        (["--set", "gamma={a: &a [1], b: [*a, *a]}"], "gamma must be a real number in [0, 1], got"),
         (["--set", "policy_kwargs=dict(net_arch=[8192, 8192])"], "net_arch must have at most 33,554,432 weights"),
     ],
 )
@@ -410,31 +410,37 @@ def test_the_command_line_refuses_an_existing_folder(finished, capsys):
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENT_IDS)
-@pytest.mark.parametrize("algorithm", training.ALGORITHMS)
+@pytest.mark.parametrize("algorithm", settings.ALGORITHMS)
 def test_every_environment_has_hyperparameters_that_are_read_as_rl_zoo_reads_them(algorithm, env_id):
     file = storage.HYPERPARAMETERS / f"{algorithm}.yml"
     raw = yaml.safe_load(file.read_text(encoding="utf-8"))[env_id]
-    ours = training.read_hyperparameters(algorithm, env_id)
+    ours = settings.read_hyperparameters(algorithm, env_id)
     assert {name for name in raw if raw[name] == ours[name]} >= set(raw) - {"policy_kwargs"}
     zoo = eval(raw["policy_kwargs"], {"nn": torch.nn})  # as RL Zoo does, with a file of our own
     zoo["activation_fn"] = zoo["activation_fn"].__name__
     assert zoo == ours["policy_kwargs"]
     json.dumps(ours)
-    assert training.make_plan(env_id, algorithm).steps == raw["n_timesteps"]
+    assert make_plan(env_id, algorithm).steps == raw["n_timesteps"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", training.ALGORITHMS)
+@pytest.mark.parametrize("algorithm", settings.ALGORITHMS)
 def test_rl_zoo_trains_from_the_same_files(algorithm, tmp_path):
     what = ["--algo", algorithm, "--env", BELT, "--gym-packages", "sd_friction_env", "-n", "500", "-f", str(tmp_path)]
     file = ["--conf-file", str(storage.HYPERPARAMETERS / f"{algorithm}.yml"), "--eval-freq", "-1", "--device", "cpu"]
     subprocess.run([sys.executable, "-m", "rl_zoo3.train", *what, *file], check=True, cwd=tmp_path, timeout=300)
 
 
+@pytest.mark.parametrize("algorithm", settings.ALGORITHMS)
+def test_every_hyperparameter_is_an_argument_of_its_algorithm(algorithm):
+    taken = inspect.signature(networks.ALGORITHM_CLASSES[algorithm]).parameters
+    assert set(settings.allowed_hyperparameters(algorithm)) - set(settings.OURS) <= set(taken)
+
+
 @pytest.mark.parametrize("value", [10**400, -(10**5000), 1j], ids=["large", "larger", "complex"])
 def test_numbers_beyond_floating_point_are_refused_by_name(value):
-    with pytest.raises((TypeError, ValueError), match=r"gamma must be a number in \[0, 1\], got "):
-        training.check_hyperparameters("ppo", {"gamma": value})
+    with pytest.raises((TypeError, ValueError), match=r"gamma must be a (finite|real) number in \[0, 1\], got "):
+        settings.check_hyperparameters("ppo", {"gamma": value})
 
 
 @pytest.mark.parametrize(
@@ -446,7 +452,7 @@ def test_numbers_beyond_floating_point_are_refused_by_name(value):
     ],
 )
 def test_policy_arguments_are_parsed_from_rl_zoos_strings(text, values):
-    assert training.parse_policy_kwargs(text) == values
+    assert settings.parse_policy_kwargs(text) == values
 
 
 @pytest.mark.parametrize(
@@ -465,7 +471,7 @@ def test_policy_arguments_are_parsed_from_rl_zoos_strings(text, values):
 )
 def test_policy_arguments_that_are_more_than_data_are_refused(text):
     with pytest.raises(ValueError, match=r"policy_kwargs|activation_fn"):
-        training.parse_policy_kwargs(text)
+        settings.parse_policy_kwargs(text)
 
 
 def test_a_batch_is_made_to_fit_what_there_is_to_learn_from():
@@ -477,16 +483,16 @@ def test_a_batch_is_made_to_fit_what_there_is_to_learn_from():
 
 
 def test_training_seeds_are_no_evaluation_seeds_and_differ_between_runs():
-    assert training.training_seed(0) == 2**32
-    assert training.training_seed(0, 65535) < training.training_seed(1)
-    assert max(*evaluation.EVALUATION_SEEDS, *evaluation.VALIDATION_SEEDS) < training.training_seed(0)
+    assert training_seed(0) == 2**32
+    assert training_seed(0, 65535) < training_seed(1)
+    assert max(*evaluation.EVALUATION_SEEDS, *evaluation.VALIDATION_SEEDS) < training_seed(0)
 
 
 def test_training_environments_are_the_environment_itself():
-    envs = training.make_training_envs(FORCE, {"episode_steps": 20}, 3, 5)
+    envs = models.make_training_envs(FORCE, {"episode_steps": 20}, 3, 5)
     alone = [evaluation.make_env(FORCE, {"episode_steps": 20}) for _ in range(3)]
     first = envs.reset()
-    singles = [env.reset(seed=training.training_seed(5, i))[0] for i, env in enumerate(alone)]
+    singles = [env.reset(seed=training_seed(5, i))[0] for i, env in enumerate(alone)]
     assert np.array_equal(first, singles)
     ends = []
     rng = np.random.default_rng(0)
@@ -508,16 +514,15 @@ def test_training_environments_are_the_environment_itself():
 
 
 def test_rewards_are_scaled_by_one_law_in_both_forms():
-    settings = training.read_hyperparameters("ppo", FORCE)
-    scale, power = training.reward_scaling(settings)
-    envs = training.make_training_envs(FORCE, {}, 1, 0, scaling=(scale, power))
+    scale, power = settings.reward_scaling(settings.read_hyperparameters("ppo", FORCE))
+    envs = models.make_training_envs(FORCE, {}, 1, 0, scaling=(scale, power))
     envs.reset()
     _, rewards, _, _ = envs.step(np.array([[0.5]], np.float32))
     terms = envs.unwrapped.batch_info
     raw = sum(terms[f"reward_{term}"][0] for term in ("vibration", "effort", "stick", "contact_loss"))
     assert rewards[0] == pytest.approx(-scale * abs(raw) ** power, rel=1e-6)
     wrapped = ScaledReward(gym.make(FORCE), scale=scale, power=power)
-    wrapped.reset(seed=training.training_seed(0))
+    wrapped.reset(seed=training_seed(0))
     assert wrapped.step(np.array([0.5], np.float32))[1] == pytest.approx(rewards[0], rel=1e-6)
     with pytest.raises(ValueError, match="power must be"):
         ScaledReward(gym.make(FORCE), power=0.0)
@@ -528,8 +533,8 @@ def test_a_network_sees_the_same_frames_as_in_training():
     frames = 3
     env_id = "SDFriction/BeltSpeedSensed-v0"
     envs = VecFrameStack(DummyVecEnv([lambda: evaluation.make_env(env_id, {"episode_steps": 7})] * 2), frames)
-    policy = training.build_policy("ppo", envs.observation_space, envs.action_space, {"net_arch": [8]})
-    network = training.network_policy(policy, frames)
+    policy = networks.build_policy("ppo", envs.observation_space, envs.action_space, {"net_arch": [8]})
+    network = networks.network_policy(policy, frames)
     envs.seed(3)
     stacked = envs.reset()
     state, starts = None, np.ones(2, dtype=bool)
@@ -541,15 +546,15 @@ def test_a_network_sees_the_same_frames_as_in_training():
     envs.close()
 
 
-@pytest.mark.parametrize("algorithm", training.ALGORITHMS)
+@pytest.mark.parametrize("algorithm", settings.ALGORITHMS)
 @pytest.mark.parametrize("net_arch", [[], [16], [32, 8, 8]])
 @pytest.mark.parametrize("activation", ["Tanh", "ReLU"])
 def test_the_numpy_actor_equals_the_torch_actor(algorithm, net_arch, activation, tmp_path):
     space = evaluation.make_env(BELT)
     arguments = {"net_arch": net_arch, "activation_fn": activation}
     torch.manual_seed(1)
-    policy = training.build_policy(algorithm, space.observation_space, space.action_space, arguments)
-    network = training.network_policy(policy)
+    policy = networks.build_policy(algorithm, space.observation_space, space.action_space, arguments)
+    network = networks.network_policy(policy)
     network.save(tmp_path / "policy.npz")
     seen = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
     by_torch, _ = policy.predict(seen, deterministic=True)

@@ -18,7 +18,9 @@ from optuna.trial import FixedTrial, TrialState
 
 from sd_friction_env import ENVIRONMENT_IDS, Table
 from sd_friction_env.cli.main import main
-from sd_friction_env.learning import evaluation, runs, training, tuning
+from sd_friction_env.learning import evaluation, runs, settings, training, tuning
+from sd_friction_env.learning.plan import make_plan
+from sd_friction_env.learning.tuning import trial
 
 ROOT = Path(__file__).parents[2]
 FORCE = "SDFriction/Force-v0"
@@ -75,7 +77,7 @@ def scripted(monkeypatch, *rows_of_trials):
             report({"steps": steps, "credited_return": credited, "mean_return": mean, "suppressed": 0.5})
         return True
 
-    monkeypatch.setattr(tuning, "run_plan", run_plan)
+    monkeypatch.setattr(trial, "run_plan", run_plan)
     return plans
 
 
@@ -93,7 +95,7 @@ def same(*plans):
 # The space ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algorithm", runs.ALGORITHMS)
+@pytest.mark.parametrize("algorithm", settings.ALGORITHMS)
 @pytest.mark.parametrize("env_id", ENVIRONMENT_IDS)
 def test_the_space_holds_the_hyperparameters_that_are_shipped(algorithm, env_id):
     search = tuning.make_search(env_id, algorithm)
@@ -103,7 +105,7 @@ def test_the_space_holds_the_hyperparameters_that_are_shipped(algorithm, env_id)
     assert ("frame_stack" in values) == ("frame_stack" in search.plan.hyperparameters)
 
 
-@pytest.mark.parametrize("algorithm", runs.ALGORITHMS)
+@pytest.mark.parametrize("algorithm", settings.ALGORITHMS)
 def test_every_corner_of_the_space_is_a_plan_that_its_file_gives_again(algorithm, tmp_path):
     search = tuning.make_search("SDFriction/BeltSpeedSensed-v0", algorithm)
     for corner in range(2):
@@ -114,8 +116,8 @@ def test_every_corner_of_the_space_is_a_plan_that_its_file_gives_again(algorithm
         assert {d.name: d.suggest(FixedTrial(values)) for d in search.space} == values  # in its range
         plan = search.trial_plan(values, 0)
         file = tmp_path / "best.yml"
-        file.write_text(yaml.safe_dump({plan.env_id: tuning.zoo_settings(plan.hyperparameters)}))
-        again = training.make_plan(plan.env_id, algorithm, hyperparameter_file=file)
+        file.write_text(yaml.safe_dump({plan.env_id: settings.zoo_settings(plan.hyperparameters)}))
+        again = make_plan(plan.env_id, algorithm, hyperparameter_file=file)
         assert again.hyperparameters == {"policy": "MlpPolicy", **plan.hyperparameters}
 
 
@@ -132,7 +134,7 @@ def test_what_is_fixed_is_not_searched():
     assert "n_epochs" not in names
     assert {"learning_rate", "net", "reward_power", "log_std_end"} <= names
     assert "log_std_init" not in names  # exploration is annealed, and begins at log_std_start
-    overrides = {"env_wrapper": [{training.WRAPPER: {"scale": 0.2}}], "policy_kwargs": "dict(net_arch=[8])"}
+    overrides = {"env_wrapper": [{settings.WRAPPER: {"scale": 0.2}}], "policy_kwargs": "dict(net_arch=[8])"}
     overrides["callback"] = []
     names = {dimension.name for dimension in tiny_search(overrides=overrides).space}
     assert not names & {"reward_power", "net", "activation", "log_std_init", "log_std_start", "log_std_end"}
@@ -156,8 +158,8 @@ def test_an_episode_that_is_not_suppressed_counts_no_more_than_a_passive_one():
     from sd_friction_env.control.policies import ConstantPolicy, VelocityFeedback, ZeroPolicy
 
     def values(policy, env_id):
-        plan = training.make_plan(env_id, "ppo", eval_episodes=5)
-        return tuning.credited_return(policy, plan)
+        plan = make_plan(env_id, "ppo", eval_episodes=5)
+        return training.validate(policy, plan)
 
     slow = values(ConstantPolicy(-1.0), "SDFriction/BeltSpeed-v0")  # a slow belt pays, and suppresses nothing
     passive = values(ZeroPolicy(), "SDFriction/BeltSpeed-v0")
@@ -220,29 +222,29 @@ def test_a_training_that_fails_counts_says_why_and_is_not_tried_again(storage, m
 # The study ------------------------------------------------------------------------------------------------------------
 
 
-def test_one_worker_gives_the_same_trials_twice_however_often_it_is_stopped(storage, monkeypatch):
-    """Training is a formula here: for its first ten trials the sampler goes by chance alone, then it learns."""
-    stops = set()
+def test_one_worker_gives_the_same_trials_twice_and_another_seed_gives_others(storage, monkeypatch):
+    """Training is a formula here: for its first ten trials the sampler draws at random, then it learns."""
 
     def run_plan(plan, report, should_stop=lambda: False):
         rate = float(plan.hyperparameters["learning_rate"].removeprefix("lin_"))
         value = -abs(np.log(rate / 1e-3)) - 1e-10 * plan.seed
         report({"steps": plan.eval_freq, "credited_return": value, "mean_return": value, "suppressed": 1.0})
-        stops.add(len(stops))
-        return len(stops) not in interrupted
+        return True
 
-    monkeypatch.setattr(tuning, "run_plan", run_plan)
-    search, interrupted = small_search(), ()
-    through = study_of(search, storage, 14, name="through")
-    stops.clear()
-    interrupted = (1, 4, 12)
-    again = study_of(search, storage, 2, name="again")
-    assert [trial.state for trial in again.trials] == [TrialState.FAIL, TrialState.COMPLETE, TrialState.COMPLETE]
-    tuning.work(search, storage, "again", 14)
-    assert outcome(again) == outcome(through)
-    assert len(again.get_trials(states=[TrialState.FAIL])) == 3
-    assert len({str(params) for params, *_ in outcome(through)}) == 14
-    assert outcome(study_of(small_search(seed=1), storage, 1, name="other"))[0] != outcome(through)[0]
+    monkeypatch.setattr(trial, "run_plan", run_plan)
+    first, again = (study_of(small_search(), storage, 14, name=name) for name in ("first", "again"))
+    assert outcome(again) == outcome(first)
+    assert len({str(params) for params, *_ in outcome(first)}) == 14
+    assert outcome(study_of(small_search(seed=1), storage, 1, name="other"))[0] != outcome(first)[0]
+
+
+def test_a_continued_study_and_another_worker_draw_other_trials(storage, monkeypatch):
+    scripted(monkeypatch, *[[-1.0]] * 5)
+    study = study_of(small_search(), storage, 2)
+    tuning.work(small_search(), storage, "study", 4)
+    assert len({str(params) for params, *_ in outcome(study)}) == 4
+    tuning.work(small_search(), storage, "study", 5, worker=1)
+    assert len({str(params) for params, *_ in outcome(study)}) == 5
 
 
 def test_a_trial_that_is_stopped_in_its_midst_is_queued_and_repeated(storage):
@@ -252,21 +254,10 @@ def test_a_trial_that_is_stopped_in_its_midst_is_queued_and_repeated(storage):
     asked = iter(range(10**6))
     tuning.work(search, storage, "stopped", 2, should_stop=lambda: next(asked) >= 200)
     assert len(tuning.finished_trials(stopped)) == 1  # 128 steps of each, and some questions between them
-    assert [trial.params for trial in stopped.get_trials(states=[TrialState.WAITING])] == [outcome(through)[1][0]]
+    assert len(stopped.get_trials(states=[TrialState.WAITING])) == 1
     assert not stopped.get_trials(states=[TrialState.RUNNING])
     tuning.work(search, storage, "stopped", 2)
     assert outcome(stopped) == outcome(through)
-
-
-def test_two_workers_that_begin_the_last_trial_at_once_run_one(storage, monkeypatch):
-    scripted(monkeypatch, [-1.0])
-    search = small_search()
-    tuning.open_study(search, storage, "study")
-    study = optuna.load_study(study_name="study", storage=storage)
-    first, second = study.ask(), study.ask()
-    with pytest.raises(tuning._InterruptedTrialError):
-        tuning._objective(second, search, 1, lambda: False)
-    assert tuning._objective(first, search, 1, lambda: False) == -1.0
 
 
 def test_the_first_trial_is_the_file_itself(storage, monkeypatch):
@@ -309,7 +300,7 @@ def test_another_search_space_and_another_programs_study_are_refused(storage):
         tuning.open_study(dataclasses.replace(search, space=search.space[1:]), storage, "study")
     foreign = optuna.create_study(storage=storage, study_name="foreign", direction="maximize")
     foreign.add_trial(optuna.create_trial(value=1.0))
-    with pytest.raises(tuning.StudyError, match="not one of this program"):
+    with pytest.raises(tuning.StudyError, match="was not made by this program"):
         tuning.open_study(search, storage, "foreign")
     assert not foreign.user_attrs
 
@@ -375,7 +366,7 @@ def test_ctrl_c_leaves_a_study_that_the_same_command_continues_and_training_take
     assert main(["tune", *command(storage, "--trials", str(finished), "--out", str(out))]) == 0
     assert f"{finished} trials:" in capsys.readouterr().out
     best = tuning.best_trials(study)[0]
-    assert training.read_hyperparameters("ppo", FORCE, out).items() >= best.user_attrs["hyperparameters"].items()
+    assert settings.read_hyperparameters("ppo", FORCE, out).items() >= best.user_attrs["hyperparameters"].items()
     folder = tmp_path / "run"
     words = ["--task", "force", "--algo", "ppo", "--hyperparameters", str(out), "--run-folder", str(folder)]
     assert main(["train", *words, "--no-progress", "--env-arg", "episode_steps=40"]) == 0
@@ -403,7 +394,7 @@ def _states(database):
         (["--trials", "0"], r"trials must be a whole number in \[1, \d+\], got 0"),
         (["--workers", "-1"], r"workers must be a whole number in \[1, 256\], got -1"),
         (["--evaluations", "513"], r"evaluations must be a whole number in \[1, 512\], got 513"),
-        (["--pruner", "rose"], r"pruner must be one of median, hyperband, none, got 'rose'"),
+        (["--pruner", "rose"], r"pruner must be one of 'median', 'hyperband', 'none', got 'rose'"),
         (["--seed", "-1"], r"seed must be a whole number in \[0, 4294967295\], got -1"),
         (["--timesteps", "0"], r"timesteps must be a whole number"),
         (["--study", " "], r"study must be a name of 1 to 200 characters"),
@@ -426,7 +417,7 @@ def test_files_of_others_are_left_alone(storage, tmp_path, capsys):
     mine = tmp_path / "mine.yml"
     mine.write_text("precious: 1\n")
     (tmp_path / "study.db").write_text("no database, " * 100)
-    for more, said in ((["--out", str(mine)], "no file of this program"), ([], "file is not a database")):
+    for more, said in ((["--out", str(mine)], "was not written by this program"), ([], "file is not a database")):
         assert main(["tune", *command(storage, "--trials", "1", *more)]) == 2
         errors = capsys.readouterr().err
         assert len(errors.splitlines()) == 1

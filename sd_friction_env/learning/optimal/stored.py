@@ -1,0 +1,267 @@
+"""Stored optima: returns and action sequences with a fingerprint of their environment."""
+
+import contextlib
+import dataclasses
+import functools
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sd_friction_env.control.pretrained import close
+from sd_friction_env.learning.optimal.problem import (
+    RANDOMISED,
+    SENSED,
+    TASKS,
+    Array,
+    Problem,
+    make_bare_env,
+    make_problem,
+)
+from sd_friction_env.storage import (
+    AGENTS,
+    file_digest,
+    load_arrays,
+    predecessor_hint,
+    read_json,
+    save_arrays,
+    write_json,
+)
+
+OPTIMUM_DIRECTORY = AGENTS / "optimum"
+# The files' names; the sensed tier differs from the nominal one only in what a controller sees.
+_FILES = {
+    **{env_id: task for tier in (TASKS, SENSED) for task, env_id in tier.items()},
+    **{env_id: f"{task}-randomised" for task, env_id in RANDOMISED.items()},
+}
+ACTION_LEVELS = 32767  # stored actions are whole numbers of 1/32767: half the size, and far finer than it matters
+GOLDEN_STEPS = 60
+GOLDEN_TOLERANCE = 1e-7  # other builds round differently, and stick-slip may amplify that; a changed law moves 1e-3
+_UNSEEN = ("sensor", "sensor_noise", "sensor_delay", "observation_limit", "x_offset", "x_scale", "v_scale")
+
+
+class DamagedStudyError(RuntimeError):
+    """A file of a stored optimum is damaged."""
+
+
+def encode(actions: Array) -> NDArray[np.int16]:
+    """Return actions in [-1, 1] as whole numbers of 1/32767."""
+    return np.round(actions * ACTION_LEVELS).astype(np.int16)
+
+
+def decode(levels: NDArray[np.int16]) -> NDArray[np.float32]:
+    """Return stored actions as the environment takes them."""
+    return (levels / ACTION_LEVELS).astype(np.float32)
+
+
+def fingerprint(env_id: str, seeds: Sequence[int]) -> dict[str, Any]:
+    """Return what a stored optimum depends on: configuration, starts (x, v) and a golden rollout, all JSON values.
+
+    Where parameters are randomised, ``draws`` holds those of each seed, in the order of their names.
+    """
+    env = make_bare_env(env_id)
+    task = {name: value for name, value in dataclasses.asdict(env.task).items() if name not in _UNSEEN}
+    configuration = {"task": task, "parameters": dataclasses.asdict(env.nominal)}
+    problem = make_problem(env_id, seeds)
+    names = sorted(env.task.randomise or ())
+    draws = {"draws": [[getattr(plant, name) for name in names] for plant in problem.parameters]} if names else {}
+    env.reset(options={"x": 0.0}, seed=0)
+    golden = []
+    for t in range(GOLDEN_STEPS):
+        # Each push lasts three intervals: the mass crosses, sticks and breaks away, on both actuators.
+        action = np.array([(7 * (t // 3) % 11) / 5.0 - 1.0], np.float32)
+        _, reward, _, _, info = env.step(action)
+        golden.append([info["x"], info["v"], info["v_belt"], float(reward)])
+    starts = problem.starts[:, :2].tolist()
+    return {"configuration": json.loads(json.dumps(configuration)), "starts": starts, **draws, "golden": golden[4::5]}
+
+
+def check_fingerprint(stored: dict[str, Any], env_id: str, seeds: Sequence[int]) -> None:
+    """Raise unless the environment is the one that a stored optimum was computed for.
+
+    Raises:
+        RuntimeError: naming what changed.
+    """
+    now = fingerprint(env_id, seeds)
+    changed = []
+    for part, values in now["configuration"].items():
+        # An argument added since then has a default; the golden rollout shows whether that changes anything.
+        configuration = stored.get("configuration")
+        before = configuration.get(part) if isinstance(configuration, dict) else None
+        if not isinstance(before, dict) or not before:
+            changed.append(f"{part}: not stored")
+            continue
+        names = sorted(name for name in before if before[name] != values.get(name))
+        changed += [f"{part} {name}: {before.get(name)!r} -> {values.get(name)!r}" for name in names]
+    for part, what in (
+        ("starts", "the starts of the evaluation seeds"),
+        ("draws", "the parameters of the evaluation seeds"),
+        ("golden", "the dynamics or the reward"),
+    ):
+        if not close(stored.get(part, []), now.get(part, []), GOLDEN_TOLERANCE):
+            changed.append(what)
+    if changed:
+        raise RuntimeError(
+            f"the stored optimum of {env_id} was computed for another environment ({'; '.join(changed)}): "
+            f"recompute it with `{command_of(env_id)}`"
+        )
+
+
+@contextlib.contextmanager
+def _reading(path: Path, env_id: str) -> Iterator[None]:
+    """Turn errors of reading a file into a :class:`DamagedStudyError` that names it and the remedy."""
+    try:
+        yield
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise DamagedStudyError(
+            f"{str(path)!r} does not hold the optimum of {env_id}, or is damaged ({type(error).__name__}: {error})"
+            f"{predecessor_hint(path)}: recompute it with `{command_of(env_id)}`"
+        ) from None
+
+
+def _paths(env_id: str, directory: Path) -> tuple[Path, Path]:
+    return directory / f"{_FILES[env_id]}.json", directory / f"{_FILES[env_id]}.npz"
+
+
+def value_path(env_id: str, directory: Path) -> Path:
+    """Return the file of a nominal task's value function."""
+    return directory / f"{_FILES[env_id]}-value.npz"
+
+
+def save_optimum(
+    problem: Problem, seeds: Sequence[int], actions: Array, about: dict[str, Any], directory: Path = OPTIMUM_DIRECTORY
+) -> Array:
+    """Store sequences, their returns and the fingerprint; return the returns of the sequences as stored, shape (n,).
+
+    Existing files are kept as their predecessors, "NAME.previous".
+
+    Args:
+        actions: shape (n, steps). about: JSON values on how they were found.
+    """
+    levels = encode(actions)
+    returns = problem.returns(decode(levels).astype(np.float64))
+    table, sequences = _paths(problem.env_id, directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    save_arrays(sequences, {"levels": levels}, compress=True, keep=True)
+    content = {
+        "env_id": problem.env_id,
+        "mean_return": float(returns.mean()),
+        **about,
+        "seeds": [int(seed) for seed in seeds],
+        "returns": returns.tolist(),
+        "fingerprint": fingerprint(problem.env_id, seeds),
+        "sequences": f"sha256:{file_digest(sequences)}",
+    }
+    write_json(table, content, indent=None, keep=True)  # one list per line: small, and a change shows as one line
+    return returns
+
+
+def stored_study(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[str, Any]:
+    """Return the table of a stored optimum, with ``command``, ``stages`` (mean return by stage) and
+    ``value_estimates`` (mean by grid).
+
+    Raises:
+        FileNotFoundError: if nothing is stored for the id.
+        DamagedStudyError: if the file is damaged.
+    """
+    env_id = bare_id(env_id)
+    if env_id not in _FILES or not _paths(env_id, directory)[0].exists():
+        stored = [name for name in _FILES if _paths(name, directory)[0].exists()]
+        raise FileNotFoundError(f"no optimum is stored for {env_id!r}; stored: {', '.join(stored) or 'none'}")
+    path = _paths(env_id, directory)[0]
+    with _reading(path, env_id):
+        content: dict[str, Any] = read_json(path)
+        of, seeds, returns = content["env_id"], content["seeds"], np.array(content["returns"], dtype=float)
+        if _FILES.get(of) != _FILES[env_id]:
+            raise ValueError(f"it is of {of!r}")
+        if not seeds or returns.shape != (len(seeds),) or any(type(seed) is not int for seed in seeds):
+            raise ValueError("it must hold one return for each of one or more seeds")
+        if not np.isfinite(returns).all():
+            raise ValueError("a return is not finite")
+        if not isinstance(content["fingerprint"], dict):
+            raise ValueError("it has no fingerprint")
+    return content
+
+
+def command_of(env_id: str) -> str:
+    """Return the command that computes the optimum of an environment."""
+    task, _, randomised = _FILES[env_id].partition("-")
+    return f"sd-friction optimum --task {task}" + (" --tier randomised" if randomised else "")
+
+
+@functools.lru_cache(maxsize=8)
+def _checked_table(env_id: str, directory: Path) -> dict[int, float]:
+    stored = stored_study(env_id, directory)
+    check_fingerprint(stored["fingerprint"], env_id, stored["seeds"])
+    return dict(zip(stored["seeds"], stored["returns"], strict=True))
+
+
+def stored_returns(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[int, float] | None:
+    """Return the best known returns that are stored for an id, by seed; None if none are stored.
+
+    See :func:`optimal_returns`.
+
+    Raises:
+        RuntimeError: if the environment has changed since they were computed, or (DamagedStudyError) the file cannot be
+            read.
+    """
+    env_id = bare_id(env_id)
+    if env_id not in _FILES or not _paths(env_id, directory)[0].exists():
+        return None
+    return dict(_checked_table(env_id, directory))
+
+
+def bare_id(env_id: str) -> str:
+    """Return an environment's id without the module before it."""
+    return env_id.rpartition(":")[2]
+
+
+def optimal_returns(
+    env_id: str, seeds: Sequence[int], directory: Path = OPTIMUM_DIRECTORY
+) -> NDArray[np.float64] | None:
+    """Return the best known undiscounted return from the starts of ``reset(seed=...)``, shape (n,).
+
+    On the randomised tier it is that of a controller that knows each episode's parameters; on the sensed tier that of
+    one that sees the state (the nominal optimum: plant, starts and reward are the same). Both are upper bounds for
+    controllers that do not. None if the id has no reference.
+
+    Raises:
+        ValueError: if a seed is not among those stored.
+        RuntimeError: if the environment has changed since the reference was computed, or (DamagedStudyError) its file
+            cannot be read.
+    """
+    env_id = bare_id(env_id)
+    table = stored_returns(env_id, directory)
+    if table is None:
+        return None
+    missing = [int(seed) for seed in seeds if int(seed) not in table]
+    if missing:
+        raise ValueError(
+            f"no optimum is stored for seed {missing[0]} of {env_id}; stored: {min(table)} to {max(table)} "
+            f"({len(table)} seeds)"
+        )
+    return np.array([table[int(seed)] for seed in seeds])
+
+
+def optimal_actions(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> tuple[list[int], NDArray[np.float32]]:
+    """Return the stored seeds and their action sequences, shape (n, steps).
+
+    Raises:
+        FileNotFoundError: if nothing is stored for the id.
+        DamagedStudyError: if a file is damaged.
+    """
+    stored = stored_study(env_id, directory)
+    path = _paths(bare_id(env_id), directory)[1]
+    if not path.exists():
+        raise FileNotFoundError(f"no file of actions {str(path)!r}")
+    with _reading(path, bare_id(env_id)):
+        digest = f"sha256:{file_digest(path)}"
+        if stored.get("sequences", digest) != digest:
+            raise ValueError("it is not the file that was stored with the table of returns")
+        levels = load_arrays(path, "i")["levels"]
+        if levels.ndim != 2 or len(levels) != len(stored["seeds"]) or levels.dtype != np.int16:
+            raise ValueError(f"levels {levels.dtype} {levels.shape} are not those of {len(stored['seeds'])} seeds")
+    return stored["seeds"], decode(levels)

@@ -156,11 +156,11 @@ def test_a_model_that_differs_is_not_written(tmp_path, monkeypatch, capsys):
     ("arguments", "message"),
     [
         (["--out", "a.onnx"], "name a run folder or a policy.npz, or --task"),
-        (["--task", "force", "--out", "a.txt"], "the ending .onnx"),
+        (["--task", "force", "--out", "a.txt"], "--out must end in .onnx"),
         (["--task", "force", "--out", "nowhere/a.onnx"], "in a folder that exists"),
         (["--task", "force", "--out", "a.onnx", "--trials", "1"], "--trials must be at least 2, got 1"),
         (["nothing.npz", "--task", "force", "--out", "a.onnx"], "nothing.npz"),
-        (["nothing.npz", "--out", "a.onnx"], "--env-id is needed"),
+        (["nothing.npz", "--out", "a.onnx"], "nothing.npz"),
         (["runs/nothing", "--out", "a.onnx"], "there is no run folder"),
         (["--task", "rope", "--out", "a.onnx"], "invalid choice: 'rope'"),
         (["--tier", "sensed", "--out", "a.onnx"], "--tier sensed needs --task"),

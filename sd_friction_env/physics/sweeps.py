@@ -27,10 +27,17 @@ from typing import Any, Literal, Self, TypeAlias, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env.physics.basins import Basins, basins, checked_grid
+from sd_friction_env.physics.basins import Basins, basins
 from sd_friction_env.physics.curves import amplitude_curve, attractor_curves, checked_belt_speeds, cycle_table
 from sd_friction_env.physics.forced import Direction, bifurcation_diagram
-from sd_friction_env.physics.parameters import STATE_LIMIT, OscillatorParameters, checked_choice, checked_number
+from sd_friction_env.physics.parameters import (
+    STATE_LIMIT,
+    OscillatorParameters,
+    checked_choice,
+    checked_count,
+    checked_number,
+)
+from sd_friction_env.physics.starts import checked_grid
 from sd_friction_env.physics.tables import Table
 from sd_friction_env.storage import (
     LockedError,
@@ -51,7 +58,7 @@ ChunkFunction: TypeAlias = Callable[[Any], Columns]
 
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
 STARTS_A_CHUNK, SPEEDS_A_CHUNK = 250_000, 25
-_MOST_WORKERS = 10_000
+_MOST_WORKERS, _MOST = 10_000, 1_000_000_000
 _CHUNKS_A_WORKER = 2  # in each wave, where results come in waves
 _WATCH = 0.5  # seconds between two looks at whether the parent lives
 _PATIENCE = 3  # times that workers may be lost in a row with no chunk finished between
@@ -92,9 +99,7 @@ class Engine:
     def __post_init__(self) -> None:
         checked_choice("backend", self.backend, BACKENDS)
         if self.workers is not None:
-            workers = checked_number("workers", self.workers, 1, _MOST_WORKERS)
-            if workers != int(workers):
-                raise ValueError(f"workers must be a whole number in [1, {_MOST_WORKERS}], got {self.workers!r}")
+            checked_count("workers", self.workers, 1, _MOST_WORKERS)
         if self.address is not None and self.backend not in ("dask", "ray"):
             raise ValueError(f"address goes with the backends 'dask' and 'ray', got {self.address!r}")
         needed = {"loky": ("joblib",), "dask": ("joblib", "distributed"), "ray": ("joblib", "ray")}
@@ -402,7 +407,7 @@ def amplitude_sweep(
     speeds = checked_belt_speeds(belt_speeds)
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
     v = None if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
-    size = _checked_count("chunk", chunk, 1)
+    size = checked_count("chunk", chunk, 1, _MOST)
     pieces = [speeds[i : i + size] for i in range(0, len(speeds), size)]
     chunks = [(plant, piece, x, v, all_attractors) for plant in plants for piece in pieces]
     description = {
@@ -446,7 +451,7 @@ def basin_sweep(
         SweepError: see :func:`run_chunks`.
     """
     x, v = checked_grid(x_limits, v_limits, shape)
-    rows = max(1, _checked_count("chunk", chunk, 1) // len(x))
+    rows = max(1, checked_count("chunk", chunk, 1, _MOST) // len(x))
     description = {
         "what": "basins",
         "parameters": dataclasses.asdict(parameters),
@@ -488,7 +493,7 @@ def bifurcation_sweep(
         TypeError, ValueError: if an argument is not as said, before anything is computed.
         SweepError: see :func:`run_chunks`.
     """
-    cycles, transient = _checked_count("cycles", cycles, 1), _checked_count("transient", transient, 0)
+    cycles, transient = checked_count("cycles", cycles, 1, _MOST), checked_count("transient", transient, 0, _MOST)
     numbers = np.unique(np.asarray(values, dtype=np.float64)).tolist()
     for plant in plants:
         for value in numbers[1:]:
@@ -509,10 +514,3 @@ def bifurcation_sweep(
 def _diagram_chunk(chunk: tuple[OscillatorParameters, str, list[float], dict[str, Any]]) -> Columns:
     plant, name, values, arguments = chunk
     return dict(bifurcation_diagram(plant, name, values, **arguments))
-
-
-def _checked_count(name: str, value: int, low: int) -> int:
-    number = checked_number(name, value, low, 1e9)
-    if number != int(number):
-        raise ValueError(f"{name} must be a whole number in [{low}, 1e9], got {value!r}")
-    return int(number)

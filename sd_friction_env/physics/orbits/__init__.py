@@ -5,14 +5,13 @@ pure-slip cycle is a fixed point of the map from one maximum of x to the next. N
 matters near the end of oscillation, where transients decay ever more slowly.
 """
 
-from sd_friction_env.physics.orbits.attractors import (
-    SlipLimit,
-    attractors,
-    limit_cycle,
-    limit_of_motion,
-    limits_of_slip,
-    same_motion,
-    slip_cycles,
+from sd_friction_env.physics.orbits.balance import (
+    Equilibrium,
+    balance_points,
+    equilibria,
+    rest_place,
+    stick_intervals,
+    traps_of,
 )
 from sd_friction_env.physics.orbits.critical import (
     CriticalBeltSpeeds,
@@ -22,13 +21,14 @@ from sd_friction_env.physics.orbits.critical import (
     hopf_belt_speed,
 )
 from sd_friction_env.physics.orbits.cycles import ContactLossError, LimitCycle, OrbitError
-from sd_friction_env.physics.orbits.equilibria import (
-    Equilibrium,
-    balance_points,
-    equilibria,
-    rest_place,
-    stick_intervals,
-    traps_of,
+from sd_friction_env.physics.orbits.limits import (
+    SlipLimit,
+    attractors,
+    limit_cycle,
+    limit_of_motion,
+    limits_of_slip,
+    same_motion,
+    slip_cycles,
 )
 from sd_friction_env.physics.orbits.return_map import ReturnMap, Section, sections
 

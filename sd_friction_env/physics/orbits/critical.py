@@ -6,7 +6,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from sd_friction_env import kernel
-from sd_friction_env.physics.orbits.equilibria import balance_points, check_unexcited, equilibria, find_root, traps_of
+from sd_friction_env.physics.orbits.balance import balance_points, check_unexcited, equilibria, find_root, traps_of
 from sd_friction_env.physics.parameters import RANGES, OscillatorParameters
 from sd_friction_env.physics.theory import FloatArray
 

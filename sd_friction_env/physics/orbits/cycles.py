@@ -7,7 +7,7 @@ from typing import Literal
 
 from sd_friction_env import kernel
 from sd_friction_env.physics import simulation
-from sd_friction_env.physics.orbits.equilibria import SMALLEST_RADIUS, traps_of
+from sd_friction_env.physics.orbits.balance import SMALLEST_RADIUS, traps_of
 from sd_friction_env.physics.parameters import OscillatorParameters, checked_number
 from sd_friction_env.physics.theory import FloatArray
 

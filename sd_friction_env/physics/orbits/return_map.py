@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sd_friction_env import kernel
-from sd_friction_env.physics.orbits.equilibria import (
+from sd_friction_env.physics.orbits.balance import (
     SMALLEST_RADIUS,
     Equilibrium,
     conserves_energy,

@@ -9,15 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sd_friction_env import kernel
-from sd_friction_env.physics.orbits.cycles import (
-    ContactLossError,
-    LimitCycle,
-    OrbitError,
-    slip_cycle,
-    steady_state,
-    stick_slip_cycle,
-)
-from sd_friction_env.physics.orbits.equilibria import (
+from sd_friction_env.physics.orbits.balance import (
     SMALLEST_RADIUS,
     Equilibrium,
     check_unexcited,
@@ -27,6 +19,14 @@ from sd_friction_env.physics.orbits.equilibria import (
     slip_dissipates,
     stick_intervals,
     traps_of,
+)
+from sd_friction_env.physics.orbits.cycles import (
+    ContactLossError,
+    LimitCycle,
+    OrbitError,
+    slip_cycle,
+    steady_state,
+    stick_slip_cycle,
 )
 from sd_friction_env.physics.orbits.return_map import LapKind, LapRange, NoLapError, ReturnMap, sections
 from sd_friction_env.physics.parameters import STATE_LIMIT, OscillatorParameters, checked_number
@@ -152,7 +152,7 @@ def _limit_of_maxima(parameters: OscillatorParameters, maximum: float, centre: E
 def _next_radius(
     laps: ReturnMap, kind: LapKind, radius: float, factor: float, contracts: bool
 ) -> tuple[float, bool, float | None]:
-    """Return the next radius on the way to a limit, whether laps end there, and the radius of a cycle passed or None."""
+    """Return the next radius on the way to a limit, whether laps end there, and the radius of a cycle passed."""
     growing = factor > 1.0
     following, at_edge = factor * radius, False
     while True:

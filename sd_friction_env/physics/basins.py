@@ -1,4 +1,4 @@
-"""Which attractor a start reaches: starts by the million, fractions of them, and grids to draw."""
+"""Basins of attraction: which attractor each start reaches, for millions of starts, and their shares."""
 
 import functools
 import math
@@ -61,7 +61,7 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
     Args:
         parameters: of the oscillator, with a moving belt.
         x, v: starts, broadcast against each other, each in [-10, 10].
-        threads: maximum number; None: as many as there are cores, where there are enough starts.
+        threads: maximum number; None: one per core, where there are enough starts.
 
     Raises:
         ValueError: if a start is not in its range, the belt stands still or the oscillator is excited.

@@ -36,7 +36,7 @@ def in_threads(work: Callable[[slice], None], count: int, per_thread: int, threa
     Starts are independent of each other: any number of threads gives the same labels.
 
     Args:
-        threads: at most so many; None: as many as there are cores.
+        threads: maximum number; None: one per core.
     """
     threads = min(threads or os.cpu_count() or 1, count // per_thread)
     if threads < 2:

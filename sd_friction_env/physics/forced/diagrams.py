@@ -127,7 +127,7 @@ def _section_at(
 
 
 def _maxima(strobe: Stroboscope, state: tuple[float, float], transient: int, cycles: int) -> FloatArray:
-    """Return the maxima of x of an unexcited motion after a transient of so many maxima."""
+    """Return the maxima of x of an unexcited motion that follow ``transient`` of them."""
     parameters = strobe.parameters
     places = np.empty(transient + cycles)
     status, written = kernel.maxima(strobe.plant, *state, parameters.belt_speed, places, traps_of(parameters))

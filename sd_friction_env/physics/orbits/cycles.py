@@ -2,7 +2,7 @@
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from sd_friction_env import kernel
@@ -31,7 +31,8 @@ class LimitCycle:
             "neutral": one of a family of closed orbits, none of which attracts, because slip conserves energy there
             (beta = 0 and level friction). :func:`limit_cycle` returns the start's own orbit,
             :func:`attractors` one entry for each family, its outermost orbit.
-        period: T; NaN for a steady state.
+        amplitude: (x_max - x_min)/2.
+        period, frequency, angular_frequency: T, 1/T and 2 pi/T; NaN for a steady state.
         stick_fraction: share of the period spent stuck.
         x_max, x_min: extremes of x.
         mean_square_velocity: mean of x'^2 over a period.
@@ -45,36 +46,29 @@ class LimitCycle:
     """
 
     kind: Kind
+    amplitude: float = field(init=False)
+    period: float = math.nan
+    frequency: float = field(init=False)
+    angular_frequency: float = field(init=False)
+    stick_fraction: float = 0.0
     x_max: float
     x_min: float
+    mean_square_velocity: float = 0.0
     x_phase0: float
     v_phase0: float
-    x_start: float
-    v_start: float
-    parameters: OscillatorParameters
-    period: float = math.nan
-    stick_fraction: float = 0.0
-    mean_square_velocity: float = 0.0
     x_breakaway: float = math.nan
     x_restick: float = math.nan
     sticks: int = 0
     forward_arcs: int = 0
     floquet_multiplier: float = math.nan
+    x_start: float
+    v_start: float
+    parameters: OscillatorParameters
 
-    @property
-    def amplitude(self) -> float:
-        """Half the peak-to-peak displacement, (x_max - x_min)/2."""
-        return simulation.amplitude(self.x_min, self.x_max)
-
-    @property
-    def frequency(self) -> float:
-        """Cycles per unit of time, 1/T; NaN for a steady state."""
-        return 1.0 / self.period
-
-    @property
-    def angular_frequency(self) -> float:
-        """Radians per unit of time, 2 pi/T; NaN for a steady state."""
-        return 2.0 * math.pi / self.period
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "amplitude", simulation.amplitude(self.x_min, self.x_max))
+        object.__setattr__(self, "frequency", 1.0 / self.period)
+        object.__setattr__(self, "angular_frequency", 2.0 * math.pi / self.period)
 
     def state(self, phase: float) -> tuple[float, float]:
         """Return (x, v) at ``phase`` in [0, 1] of the period, counted from ``x_phase0``; a steady state has only one.

@@ -82,14 +82,14 @@ format: setup ## let ruff mend and format the code
 slow: setup ## run the tests that take minutes
 	"$(RUN)" -m pytest -m slow $(ARGS)
 
-reference: setup ## print the numbers that the project promises, beside what it reaches
-	"$(RUN)" scripts/reference_numbers.py $(ARGS)
+reference: setup ## print each accuracy target next to the measured value
+	"$(RUN)" scripts/verify.py $(ARGS)
 
 hunt: setup ## hold random legal plants, tasks, files and command lines against independent answers (five minutes)
 	"$(RUN)" scripts/hunt.py $(ARGS)
 
 benchmark: setup ## measure the speed, ours and others', in one run (minutes)
-	"$(RUN)" scripts/benchmark.py $(ARGS)
+	"$(RUN)" scripts/benchmark $(ARGS)
 
 # Apart from .venv, for what they need and what we need may not go together.
 benchmark-peers: ## make .venv-peers with EnvPool and gymnax: `make benchmark` then measures them too

@@ -1,11 +1,11 @@
 """Stored files: written whole or not at all, sealed with a digest, read within bounds, and locked while in use.
 
-A file may come from anywhere, be cut short, have a flipped bit or be made to harm. So nothing in a file is believed
-before it is bounded: memory and time follow from the size of the file, never from a number in it.
+A file may come from anywhere, be cut short, have a flipped bit or be made to harm. So nothing in a file is used before
+it is checked against a bound: memory and time follow from the size of the file, never from a number in it.
 
-A *seal* is the SHA-256 digest of a file in the file itself: a JSON object has it as its last value, an archive (.npz
-of NumPy, .pt of PyTorch: both are zip files) as its comment, which other programs ignore. Files of earlier versions
-have no seal and are read without one where the caller allows it.
+A *seal* is the SHA-256 digest of a file in the file itself: the last value of a JSON object, or the comment of an
+archive (.npz of NumPy, .pt of PyTorch: both are zip files), which other programs ignore. Files of earlier versions have
+no seal and are read without one where the caller allows it.
 """
 
 import contextlib
@@ -59,11 +59,11 @@ _POLL = 0.02  # seconds between two attempts to take a lock
 
 
 class StoredFileError(ValueError):
-    """A stored file is damaged, too large, or not of the kind wanted."""
+    """A stored file is damaged, too large, or of another kind than expected."""
 
 
 class LockedError(StoredFileError):
-    """Another process is using what is locked."""
+    """Another process holds the lock."""
 
 
 # Bytes ----------------------------------------------------------------------------------------------------------------
@@ -87,7 +87,7 @@ def checked_ending(path: str | os.PathLike[str], endings: Sequence[str], name: s
 def atomic_file(path: PathLike, mode: str = "w", *, keep: bool = False) -> Iterator[Any]:
     """Open a file beside ``path`` (mode "w" for text, "wb" or "w+b" for bytes) and move it to its place when complete.
 
-    Whatever happens meanwhile (an error, a full disk, a killed process), ``path`` is the old file or the new one.
+    After an error, a full disk or a killed process, ``path`` is the old file or the new one, never a part.
 
     Args:
         keep: whether the old file is kept as its predecessor, "NAME.previous".
@@ -149,7 +149,7 @@ def read_bytes(path: PathLike, most: int = LARGEST_ARCHIVE) -> bytes:
     with open_regular(path, most) as file:
         size = os.fstat(file.fileno()).st_size
         data = file.read(size + 1)
-    if len(data) != size:  # so are some files in /proc
+    if len(data) != size:  # as for some files in /proc
         raise StoredFileError(f"{os.fspath(path)!r} is not as large as it says: another process is writing to it")
     return data
 
@@ -176,7 +176,7 @@ def file_digest(path: PathLike) -> str:
 
 @contextlib.contextmanager
 def naming(path: PathLike) -> Iterator[None]:
-    """Turn whatever goes wrong in reading a file, but for the system's refusals, into an error that names the file."""
+    """Turn any error in reading a file, except those of the operating system, into one that names the file."""
     name = repr(os.fspath(path))
     try:
         yield
@@ -290,10 +290,10 @@ def _check_digits(digits: str) -> None:
 def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text of plain data.
 
-    A few lines of aliases can stand for gigabytes: the values that a text stands for are counted before any is made.
+    A few lines of aliases can expand to gigabytes: values are counted with aliases expanded before any is made.
 
     Raises:
-        StoredFileError: if it is no such text, stands for too many values, or a key is given twice.
+        StoredFileError: if it is not valid YAML, expands to too many values, or a key is given twice.
     """
     import yaml
 
@@ -318,7 +318,7 @@ def parse_yaml(text: str) -> Any:
 
 
 def _count_values(node: Any, counts: dict[int, int]) -> int:
-    """Return how many values a node of YAML stands for, aliases included; raise if they are too many or cannot be.
+    """Return the number of values of a YAML node with aliases expanded; raise if it is too large or infinite.
 
     Args:
         counts: of the nodes seen so far, by identity; 0 while one is being counted.
@@ -376,13 +376,15 @@ def sealed_archive(path: PathLike, *, keep: bool = False) -> Iterator[BinaryIO]:
 
 @contextlib.contextmanager
 def open_archive(file: BinaryIO, *, sealed: bool = False, compressed: bool = True) -> Iterator[zipfile.ZipFile]:
-    """Open a zip archive after checking its seal, and that its entries come to no more than is reasonable.
+    """Open a zip archive after checking its seal and the total size of its entries.
 
     Args:
-        file: open for reading. sealed: whether one without a seal is refused. compressed: whether entries may be.
+        file: open for reading.
+        sealed: whether an archive without a seal is refused.
+        compressed: whether entries may be compressed.
 
     Raises:
-        StoredFileError: if it differs from its seal, or is no archive that would be written here.
+        StoredFileError: if it differs from its seal, or is not an archive of the form that this package writes.
     """
     size = file.seek(0, os.SEEK_END)
     file.seek(-min(size, _END_64.size + _END.size + _COMMENT_LENGTH), os.SEEK_END)
@@ -423,7 +425,7 @@ def open_archive(file: BinaryIO, *, sealed: bool = False, compressed: bool = Tru
 
 
 def _check_digest(file: BinaryIO, size: int, digest: bytes) -> None:
-    """Raise unless the first ``size`` bytes of a file have a digest."""
+    """Raise unless the first ``size`` bytes of a file have the digest ``digest``."""
     found = hashlib.sha256()
     file.seek(0)
     while size > 0 and (part := file.read(min(size, 2**20))):
@@ -434,7 +436,7 @@ def _check_digest(file: BinaryIO, size: int, digest: bytes) -> None:
 
 
 def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any]], *, compress: bool = False) -> None:
-    """Write arrays to an open file as an .npz archive; what :func:`load_arrays` would not inflate is not compressed.
+    """Write arrays to an open file as an .npz archive, uncompressed where :func:`load_arrays` would not inflate them.
 
     Raises:
         TypeError: if an array holds Python objects.
@@ -515,16 +517,18 @@ def _read_array(name: str, file: IO[bytes], kinds: str, is_text: bool) -> NDArra
 
 @contextlib.contextmanager
 def locked(path: PathLike, what: str, *, wait: bool = False) -> Iterator[None]:
-    """Keep other processes (and threads) out until done, by a lock of the system on a file that says who has it.
+    """Hold a lock of the operating system on a file that names its holder; exclude other processes and threads.
 
-    The system releases the lock of a process that dies, so that a file which is left behind blocks nobody.
+    The lock of a process that dies is released, so a file that it leaves behind blocks nobody.
 
     Args:
-        path: of the lock's file, which is removed in the end. what: is locked, for the message.
-        wait: until it is free; else it is refused at once.
+        path: of the lock's file, which is removed in the end.
+        what: name of the locked resource, for the message.
+        wait: whether to wait until it is free, not to raise at once.
 
     Raises:
-        LockedError: if another one has it, naming its process. OSError: if the file cannot be made or locked.
+        LockedError: if another process holds it, naming that process.
+        OSError: if the file cannot be created or locked.
     """
     target = Path(path)
     while True:
@@ -558,7 +562,7 @@ def _take_lock(file: BinaryIO) -> bool:
         if sys.platform == "win32":
             import msvcrt
 
-            file.seek(2**30)  # there, and not where others are to read who has it
+            file.seek(2**30)  # away from where others read the holder
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             import fcntl
@@ -570,7 +574,7 @@ def _take_lock(file: BinaryIO) -> bool:
 
 
 def _is_at(file: BinaryIO, path: Path) -> bool:
-    """Return whether an open file is still the one at a path: who had its lock before has removed it."""
+    """Return whether an open file is still the one at a path: its previous holder may have removed it."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except FileNotFoundError:
@@ -582,5 +586,5 @@ def _holder(file: BinaryIO) -> str:
         file.seek(0)
         about = json.loads(file.read(4096))
         return f"process {about['process']} on {about['host']} since {about['since']}"
-    except (OSError, KeyError, TypeError, ValueError):  # it has just begun, and has not said so yet
+    except (OSError, KeyError, TypeError, ValueError):  # it has only just started, and has not written its name yet
         return "another process"

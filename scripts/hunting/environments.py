@@ -114,32 +114,34 @@ def bits(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def single_rollout(made: Episode, lane: int, mode: str) -> list[dict[str, Any]]:
-    """Return what the single environment says at reset and at each step, as a batch with an autoreset mode would.
+def row_of(
+    observation: Any, info: Mapping[str, Any], reward: float = 0.0, terminated: bool = False, truncated: bool = False
+) -> dict[str, Any]:
+    """Return what a reset or a step of one environment gives, by name."""
+    return {
+        "observation": observation,
+        "info": info,
+        "reward": float(reward),
+        "terminated": bool(terminated),
+        "truncated": bool(truncated),
+    }
 
-    A step of mode "SameStep" that ends an episode has ``final``: what it said before it was reset.
+
+def single_rollout(made: Episode, lane: int, mode: str) -> list[dict[str, Any]]:
+    """Return the rows of the single environment at reset and at each step, as a batch with an autoreset mode has them.
+
+    A step of mode "SameStep" or "Disabled" that ends an episode has ``final``: its row before the reset.
     """
     env = SDFrictionEnv(**made.arguments)
-    options = made.starts[lane] if made.starts else None
-    observation, info = env.reset(seed=made.seed + lane, options=options)
-    rows = [{"observation": observation, "reward": 0.0, "terminated": False, "truncated": False, "info": info}]
+    rows = [row_of(*env.reset(seed=made.seed + lane, options=made.starts[lane] if made.starts else None))]
     over = False
     for action in made.actions[:, lane]:
         if over:
-            observation, info = env.reset()
-            rows.append(
-                {"observation": observation, "reward": 0.0, "terminated": False, "truncated": False, "info": info}
-            )
+            rows.append(row_of(*env.reset()))
             over = False
             continue
         observation, reward, terminated, truncated, info = env.step(np.array([action]))
-        row = {
-            "observation": observation,
-            "reward": float(reward),
-            "terminated": terminated,
-            "truncated": truncated,
-            "info": info,
-        }
+        row = row_of(observation, info, float(reward), terminated, truncated)
         over = terminated or truncated
         if over and mode != "NextStep":
             row["final"] = {"observation": observation, "info": info}
@@ -150,32 +152,21 @@ def single_rollout(made: Episode, lane: int, mode: str) -> list[dict[str, Any]]:
 
 
 def lane_of(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
-    """Return what a batch's info says of one environment."""
-    told = {}
+    """Return the part of a batch's info for one environment."""
+    part = {}
     for name, values in info.items():
         if name.startswith("_") or not np.all(info.get(f"_{name}", True)[lane]):
             continue
-        told[name] = lane_of(values, lane) if isinstance(values, Mapping) else values[lane]
-    return told
+        part[name] = lane_of(values, lane) if isinstance(values, Mapping) else values[lane]
+    return part
 
 
 def batch_rollout(made: Episode, lanes: list[int], mode: str, threads: int) -> list[list[dict[str, Any]]]:
-    """Return what a batch says of some of its environments, for each the same as :func:`single_rollout` returns."""
+    """Return the rows of some environments of a batch, as :func:`single_rollout` does for one."""
     n = made.actions.shape[1]
     env = SDFrictionVectorEnv(n, **made.arguments, autoreset_mode=mode, threads=threads, info_keys="all")
     observations, info = env.reset(seed=made.seed, options=made.starts)
-    rows = [
-        [
-            {
-                "observation": observations[i],
-                "reward": 0.0,
-                "terminated": False,
-                "truncated": False,
-                "info": lane_of(info, i),
-            }
-        ]
-        for i in lanes
-    ]
+    rows = [[row_of(observations[i], lane_of(info, i))] for i in lanes]
     for actions in made.actions:
         observations, rewards, terminated, truncated, info = env.step(actions[:, None])
         over = terminated | truncated
@@ -183,13 +174,7 @@ def batch_rollout(made: Episode, lanes: list[int], mode: str, threads: int) -> l
         if mode == "Disabled" and over.any():
             restarted = env.reset(options={"reset_mask": over})
         for place, i in enumerate(lanes):
-            row: dict[str, Any] = {
-                "observation": observations[i],
-                "reward": float(rewards[i]),
-                "terminated": bool(terminated[i]),
-                "truncated": bool(truncated[i]),
-                "info": lane_of(info, i),
-            }
+            row = row_of(observations[i], lane_of(info, i), rewards[i], terminated[i], truncated[i])
             if over[i] and mode == "SameStep":
                 row["final"] = {"observation": row["info"].pop("final_obs"), "info": row["info"].pop("final_info")}
             elif over[i] and mode == "Disabled":
@@ -239,14 +224,7 @@ def interpreted_trial(seed: int, index: int) -> None:
     command = [sys.executable, "-m", "scripts.hunting.environments", str(seed), str(index)]
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     try:
-        done = subprocess.run(
-            command,
-            check=False,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=100.0,
-        )
+        done = subprocess.run(command, check=False, env=environment, capture_output=True, text=True, timeout=100.0)
     except subprocess.TimeoutExpired:
         raise SetAside("interpreted, too slow") from None
     if done.returncode:

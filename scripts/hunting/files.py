@@ -1,12 +1,9 @@
-"""Try to have damaged and hostile files taken for good ones, or to make them costly.
-
-    python -m scripts.hunting.files [--seed N]
+"""Damaged and hostile files: none may be accepted as good, or be costly to refuse.
 
 Bits of checkpoints, policies and tables are flipped, files are cut short and swapped, and every reader is given files
 that are made to harm. Each must be refused by name within a second and 200 MB. Needs fork, so not Windows.
 """
 
-import argparse
 import contextlib
 import functools
 import io
@@ -22,7 +19,7 @@ import tempfile
 import time
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +27,12 @@ import numpy as np
 import torch
 
 from sd_friction_env import Table
-from sd_friction_env.cli.options import Parser, assignments
+from sd_friction_env.cli.options import assignments
 from sd_friction_env.control.policies import NetworkPolicy, load_policy
 from sd_friction_env.learning import checkpoints, classical, optimal, runs, settings, tensors, training
 from sd_friction_env.learning.plan import make_plan
 from sd_friction_env.physics.sweeps import Engine, run_chunks
-from sd_friction_env.storage import HYPERPARAMETERS, read_json, sealed_archive, write_json
+from sd_friction_env.storage import HYPERPARAMETERS, file_digest, read_json, sealed_archive, write_json
 
 FORCE = "SDFriction/Force-v0"
 SECONDS, BYTES = 1.0, 200 * 10**6
@@ -395,7 +392,7 @@ def _check_hostile(base: Path, rng: np.random.Generator) -> Iterator[tuple[str, 
             put()
             # Who damages on purpose also mends the digests that others keep of the file.
             if name == "chunk" and path.is_file() and path.stat().st_size < 10**8:
-                target = path.with_name(f"chunk-000000-{_sha256(path.read_bytes())}.npz")
+                target = path.with_name(f"chunk-000000-{file_digest(path)}.npz")
                 path.rename(target)
             if name in ("weights", "network") and path.is_file() and path.stat().st_size < 10**8:
                 _mend_config(path)
@@ -413,15 +410,9 @@ def _check_hostile(base: Path, rng: np.random.Generator) -> Iterator[tuple[str, 
                 _mend_config(path)
 
 
-def _sha256(data: bytes) -> str:
-    import hashlib
-
-    return hashlib.sha256(data).hexdigest()
-
-
 def _mend_config(path: Path) -> None:
     config = read_json(path.parent / runs.CONFIG)
-    config["files"][path.name] = _sha256(path.read_bytes())
+    config["files"][path.name] = file_digest(path)
     write_json(path.parent / runs.CONFIG, config)
 
 
@@ -465,11 +456,11 @@ def _check_bits(base: Path, rng: np.random.Generator, count: int = 25) -> Iterat
 
 
 def _check_arguments() -> Iterator[tuple[str, str]]:
+    accepted = ("no text", "a huge number", "an infinite number", "binary", "a long policy")  # may be a value
     for what, content in _yamls().items():
-        if what in ("no text", "a huge number", "an infinite number", "binary", "a long policy"):
-            continue  # other ones may be an argument's value
-        text = content.decode()
-        yield f"--set: {what}", judge(functools.partial(assignments, "--set", [f"gamma={text}"]), "--set")
+        if what not in accepted:
+            text = f"gamma={content.decode()}"
+            yield f"--set: {what}", judge(functools.partial(assignments, "--set", [text]), "--set")
 
 
 def check_files(seed: int) -> tuple[int, int, list[str]]:
@@ -491,21 +482,3 @@ def check_files(seed: int) -> tuple[int, int, list[str]]:
             if wrong:
                 failed.append(f"{what}: {wrong}")
     return tried, tried - len(failed), failed
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Try them all; return 1 if one was not held off."""
-    parser = Parser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-        prog="python -m scripts.hunting.files",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of what is tried (default: 0)")
-    tried, held, failed = check_files(parser.parse_args(arguments).seed)
-    print("\n".join([*failed, f"damaged and hostile files: {held} of {tried} refused by name within 1 s and 200 MB"]))
-    return 1 if failed else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

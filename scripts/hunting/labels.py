@@ -1,18 +1,13 @@
-"""Compare the labels of ``basins`` with direct runs of random starts of random plants.
+"""Labels of ``basins`` against direct runs of random starts of random plants.
 
-    python -m scripts.hunting.labels                          20,000 starts, seed 0
-    python -m scripts.hunting.labels --seed 3 --starts 600
-
-A direct run follows the motion by ``kernel.advance`` alone and knows nothing of return maps: it is held against the
-extremes of x of the attractor that the label names, in stretches of growing length. It is "not settled" where its
-budget of integration steps ends before the extremes do not change any more; such starts decide nothing.
+A direct run follows the motion by ``kernel.advance`` alone, without return maps: the extremes of x over stretches of
+growing length are compared with those of the attractor that the label names. It is "not settled" where its budget of
+integration steps ends before the extremes are constant; such starts decide nothing.
 """
 
-import argparse
 import functools
 import math
 import time
-from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,31 +29,34 @@ class Verdict(NamedTuple):
     why: str = ""
 
 
+_SPREAD = {  # ends of a parameter's whole range, and of its middle; the share of plants with 0
+    "alpha": (1e-3, 10.0, 0.05, 2.0, 0.0),
+    "g1": (1e-3, 100.0, 0.5, 2.0, 0.0),
+    "beta": (1e-5, 10.0, 1e-2, 2.0, 0.15),
+    "mu_s": (1e-3, 10.0, 0.05, 1.0, 0.02),
+    "v_m": (1e-2, 100.0, 0.2, 2.0, 0.0),
+    "belt_speed": (1e-3, 10.0, 0.02, 2.0, 0.0),
+    "delta": (1e-3, 1e3, 0.1, 10.0, 0.1),
+    "v_0": (1e-3, 100.0, 0.1, 2.0, 0.0),
+    "mu_v": (1e-4, 10.0, 0.01, 0.5, 0.5),
+    "kappa": (1e-4, 10.0, 0.1, 2.0, 0.1),
+}
+
+
 def draw_plant(rng: np.random.Generator) -> OscillatorParameters:
     """Return a plant from the whole accepted range; half of them from its middle."""
     wide = rng.random() < 0.5
-
-    def spread(low: float, high: float, inner_low: float, inner_high: float) -> float:
-        ends = (low, high) if wide else (inner_low, inner_high)
-        return float(np.exp(rng.uniform(*np.log(ends))))
-
-    numbers: dict[str, Any] = {"geometry": str(rng.choice(["exact", "cubic", "linear", "duffing"]))}
+    numbers: dict[str, Any] = {
+        name: 0.0 if rng.random() < zero else float(np.exp(rng.uniform(*np.log(whole if wide else middle))))
+        for name, (*whole, low, high, zero) in _SPREAD.items()
+        for middle in [(low, high)]
+    }
+    numbers["geometry"] = str(rng.choice(["exact", "cubic", "linear", "duffing"]))
     numbers["friction"] = str(rng.choice(["stribeck", "coulomb", "hyperbolic", "exponential"]))
-    numbers["alpha"] = spread(1e-3, 10.0, 0.05, 2.0)
     if numbers["geometry"] == "exact" and rng.random() < 0.3:
         numbers["alpha"] = 0.0 if rng.random() < 0.7 else float(rng.uniform(1e-3, 0.05))
-    numbers["g1"] = spread(1e-3, 100.0, 0.5, 2.0)
-    numbers["beta"] = 0.0 if rng.random() < 0.15 else spread(1e-5, 10.0, 1e-2, 2.0)
-    numbers["mu_s"] = 0.0 if rng.random() < 0.02 else spread(1e-3, 10.0, 0.05, 1.0)
     share = rng.choice([0.0, 1.0, rng.random()], p=[0.1, 0.1, 0.8])
-    numbers["mu_m"] = float(share * numbers["mu_s"])
-    numbers["mu_k"] = numbers["mu_m"]
-    numbers["v_m"] = spread(1e-2, 100.0, 0.2, 2.0)
-    numbers["belt_speed"] = spread(1e-3, 10.0, 0.02, 2.0)
-    numbers["delta"] = 0.0 if rng.random() < 0.1 else spread(1e-3, 1e3, 0.1, 10.0)
-    numbers["v_0"] = spread(1e-3, 100.0, 0.1, 2.0)
-    numbers["mu_v"] = 0.0 if rng.random() < 0.5 else spread(1e-4, 10.0, 0.01, 0.5)
-    numbers["kappa"] = 0.0 if rng.random() < 0.1 else spread(1e-4, 10.0, 0.1, 2.0)
+    numbers["mu_m"] = numbers["mu_k"] = float(share * numbers["mu_s"])
     return OscillatorParameters(**numbers)
 
 
@@ -158,33 +156,7 @@ def check_basins(seed: int, starts: int) -> tuple[int, int, list[dict[str, Any]]
             what = "undecided" if label == UNDECIDED else verdict.what
             held += what == "held"
             if what != "held":
-                rest.append(
-                    {
-                        "seed": (seed, plant_number),
-                        "verdict": what,
-                        "why": verdict.why,
-                        "p": p,
-                        "x": x,
-                        "v": v,
-                        "label": label,
-                        "attractors": [(a.kind, a.x_min, a.x_max) for a in found.attractors],
-                    }
-                )
+                known = [(a.kind, a.x_min, a.x_max) for a in found.attractors]
+                case = {"p": p, "x": x, "v": v, "label": label, "attractors": known}
+                rest.append({"seed": (seed, plant_number), "verdict": what, "why": verdict.why, **case})
     return starts, held, rest
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--starts", type=int, default=20_000)
-    parser.add_argument("--show", type=int, default=40)
-    options = parser.parse_args()
-    tried, held, rest = check_basins(options.seed, options.starts)
-    counts = Counter(r["verdict"] for r in rest)
-    for r in [r for r in rest if r["verdict"] != "not settled"][: options.show]:
-        print(r)
-    print(f"{tried} starts: {held} held, {dict(counts)}")
-
-
-if __name__ == "__main__":
-    main()

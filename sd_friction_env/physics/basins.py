@@ -1,11 +1,7 @@
-"""Which attractor a start reaches: starts by the million, fractions of them, and grids to draw."""
+"""Basins of attraction: which attractor each start reaches, for millions of starts, and their shares."""
 
 import functools
-import itertools
 import math
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +12,7 @@ from sd_friction_env.physics.orbits import (
     ContactLossError,
     LimitCycle,
     OrbitError,
+    SlipLimit,
     attractors,
     equilibria,
     limit_of_motion,
@@ -25,13 +22,12 @@ from sd_friction_env.physics.orbits import (
     traps_of,
 )
 from sd_friction_env.physics.parameters import STATE_LIMIT, OscillatorParameters, checked_number
+from sd_friction_env.physics.starts import checked_grid, in_threads
 
 LOST_CONTACT, UNDECIDED = -1, -2
 
-_Classify = Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.int8]], None]
-
 _STARTS_WORTH_A_THREAD = 20_000
-_MOST_TURNINGS, _SAMPLED_TURNINGS = 20_000, 400  # that a start is followed for, and one of those below
+_MOST_TURNINGS, _SAMPLED_TURNINGS = 20_000, 400  # over which a start is followed, and a sampled maximum
 _SAMPLED_MAXIMA = (3, 16, 240)  # first few, then many, among those with which motions leave a range of radii
 
 
@@ -51,7 +47,7 @@ class Basins:
     parameters: OscillatorParameters
 
     def fraction(self, label: int) -> tuple[float, float]:
-        """Return the share of starts with a label and its standard error were they drawn evenly, sqrt(p (1 - p)/n)."""
+        """Return the share p of starts with a label, and its standard error for uniform draws, sqrt(p (1 - p)/n)."""
         share = float((self.labels == label).mean())
         return share, math.sqrt(share * (1.0 - share) / self.labels.size)
 
@@ -59,13 +55,13 @@ class Basins:
 def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, threads: int | None = None) -> Basins:
     """Return the attractor that each start reaches.
 
-    A start is followed only until it sticks (the end of its stick interval tells the rest) or passes a maximum of x
+    A start is followed only until it sticks (the end of its stick interval decides the rest) or passes a maximum of x
     so near an equilibrium that the return map's fixed points, found beforehand, decide.
 
     Args:
         parameters: of the oscillator, with a moving belt.
         x, v: starts, broadcast against each other, each in [-10, 10].
-        threads: at most so many; None: as many as there are cores, where there are enough starts.
+        threads: maximum number; None: one per core, where there are enough starts.
 
     Raises:
         ValueError: if a start is not in its range, the belt stands still or the oscillator is excited.
@@ -76,91 +72,106 @@ def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, thre
             raise ValueError(f"{name} must hold at least one start, got shape {values.shape}")
         worst = values.flat[int(np.argmax(np.where(np.isfinite(values), np.abs(values), np.inf)))]
         checked_number(name, float(worst), -STATE_LIMIT, STATE_LIMIT)
-    found, classify = _classifier(parameters)
+    known = _labels_for(parameters)
     labels = np.empty(xs.size, dtype=np.int8)
     flat_x, flat_v = np.ascontiguousarray(xs).ravel(), np.ascontiguousarray(vs).ravel()
 
     def classify_part(part: slice) -> None:
-        classify(flat_x[part], flat_v[part], labels[part])
+        known.classify(flat_x[part], flat_v[part], labels[part])
 
-    # Starts do not know of each other: any number of threads gives the same labels. Few starts are not worth one.
-    threads = min(threads or os.cpu_count() or 1, xs.size // _STARTS_WORTH_A_THREAD)
-    if threads < 2:
-        classify_part(slice(None))
-    else:
-        edges = np.linspace(0, xs.size, 8 * threads + 1).astype(int).tolist()
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(classify_part, itertools.starmap(slice, itertools.pairwise(edges))))
-    return Basins(attractors=found, labels=labels.reshape(xs.shape), parameters=parameters)
+    in_threads(classify_part, xs.size, _STARTS_WORTH_A_THREAD, threads)
+    return Basins(attractors=known.found, labels=labels.reshape(xs.shape), parameters=parameters)
 
 
-@functools.lru_cache(maxsize=16)
-def _classifier(parameters: OscillatorParameters) -> tuple[tuple[LimitCycle, ...], _Classify]:
-    """Return the attractors, and the function that writes which of them the starts (x, v), (n,) each, reach."""
-    found = tuple(attractors(parameters))
+class _Labels:
+    """Labels of all that a start can come to, and the compiled search that reads them.
 
-    def label_of(cycle: LimitCycle | None) -> int:
-        alike = (i for i, known in enumerate(found) if cycle is not None and same_motion(cycle, known))
+    Attributes:
+        found: the attractors.
+    """
+
+    def __init__(self, parameters: OscillatorParameters) -> None:
+        self.parameters = parameters
+        self.found = tuple(attractors(parameters))
+        exits = [right for _, right in stick_intervals(parameters)]
+        traps = traps_of(parameters)
+        places = [e.x for e in equilibria(parameters)]
+        limits = {places.index(centre): rows for centre, rows in limits_of_slip(parameters)}
+        width = max(map(len, limits.values()), default=0) + 1
+        self._bounds = np.full((len(places), width), np.inf)
+        self._bound_labels = np.full((len(places), width), UNDECIDED, dtype=np.int64)
+        for i, rows in limits.items():
+            self._bounds[i, : len(rows)] = [row.radius for row in rows]
+            self._bound_labels[i, : len(rows)] = [self._label_of(row.cycle) for row in rows]
+        trap_labels = [
+            self._label_of(limit_of_motion(parameters, place, 0.0)) for place in traps[:, kernel.TRAP_X].tolist()
+        ]
+        self._known = (
+            np.array(exits, dtype=np.float64),
+            np.array([self._label_of_exit(right) for right in exits], dtype=np.int64),
+            traps,
+            np.array(trap_labels, dtype=np.int64),
+            np.array(places, dtype=np.float64),
+            self._bounds,
+            self._bound_labels,
+        )
+        self._label_ranges_that_are_left(places, limits)
+
+    def _label_of(self, cycle: LimitCycle | None) -> int:
+        alike = (i for i, known in enumerate(self.found) if cycle is not None and same_motion(cycle, known))
         return next(alike, UNDECIDED)
 
-    exits, exit_labels = [], []
-    for _, right in stick_intervals(parameters):
-        exits.append(right)
+    def _label_of_exit(self, right: float) -> int:
+        """Return the label of a mass that breaks away at the end of a stick interval."""
         try:
-            exit_labels.append(label_of(limit_of_motion(parameters, right, parameters.belt_speed)))
+            return self._label_of(limit_of_motion(self.parameters, right, self.parameters.belt_speed))
         except ContactLossError:
-            exit_labels.append(LOST_CONTACT)
+            return LOST_CONTACT
         except OrbitError:
-            exit_labels.append(UNDECIDED)
-    traps = traps_of(parameters)
-    trap_labels = [label_of(limit_of_motion(parameters, place, 0.0)) for place in traps[:, kernel.TRAP_X].tolist()]
-    places = [place.x for place in equilibria(parameters)]
-    limits = {places.index(centre): rows for centre, rows in limits_of_slip(parameters)}
-    width = max(map(len, limits.values()), default=0) + 1
-    bounds = np.full((len(places), width), np.inf)
-    bound_labels = np.full((len(places), width), UNDECIDED, dtype=np.int64)
-    for i, rows in limits.items():
-        bounds[i, : len(rows)] = [row.radius for row in rows]
-        bound_labels[i, : len(rows)] = [label_of(row.cycle) for row in rows]
-    known = (
-        np.array(exits, dtype=np.float64),
-        np.array(exit_labels, dtype=np.int64),
-        traps,
-        np.array(trap_labels, dtype=np.int64),
-        np.array(places, dtype=np.float64),
-        bounds,
-        bound_labels,
-    )
+            return UNDECIDED
 
     def classify(
-        x: NDArray[np.float64], v: NDArray[np.float64], into: NDArray[np.int8], turnings: int = _MOST_TURNINGS
+        self,
+        x: NDArray[np.float64],
+        v: NDArray[np.float64],
+        labels: NDArray[np.int8],
+        turnings: int = _MOST_TURNINGS,
     ) -> None:
-        kernel.classify(parameters.plant, parameters.belt_speed, x, v, *known, turnings, into)
+        """Write the labels of the starts (x, v), (n,) each."""
+        kernel.classify(self.parameters.plant, self.parameters.belt_speed, x, v, *self._known, turnings, labels)
 
-    def label_from(low: float, high: float) -> int:
-        """Return the label of all maxima between two places, UNDECIDED if they have not one."""
+    def _label_between(self, low: float, high: float) -> int:
+        """Return the label of all maxima between two places, UNDECIDED if they have several."""
         label = UNDECIDED
         for count in _SAMPLED_MAXIMA:
             reached = np.empty(count, dtype=np.int8)
-            classify(np.linspace(low, high, count + 2)[1:-1], np.zeros(count), reached, _SAMPLED_TURNINGS)
+            self.classify(np.linspace(low, high, count + 2)[1:-1], np.zeros(count), reached, _SAMPLED_TURNINGS)
             if (reached == UNDECIDED).any() or (reached != (reached[0] if label == UNDECIDED else label)).any():
                 return UNDECIDED
             label = int(reached[0])
         return label
 
-    # Where all maxima drift out of a range of radii, what follows is known as soon as that of its neighbours is: those
-    # that drift outwards are looked at from outside, the others from inside.
-    leaving = [(i, j, row.leaves) for i, rows in limits.items() for j, row in enumerate(rows) if row.leaves is not None]
-    outwards = [(i, j, leaves) for i, j, leaves in leaving if leaves[0] >= bounds[i, j]]
-    order = [*reversed(outwards), *(entry for entry in leaving if entry not in outwards)]
-    for _ in range(width):
-        before = bound_labels.copy()
-        for i, j, (low, high) in order:
-            if bound_labels[i, j] == UNDECIDED:
-                bound_labels[i, j] = label_from(places[i] + low, places[i] + high)
-        if np.array_equal(bound_labels, before):
-            break
-    return found, classify
+    def _label_ranges_that_are_left(self, places: list[float], limits: dict[int, list[SlipLimit]]) -> None:
+        """Label the ranges of radii that all maxima leave.
+
+        The label of such a range is known as soon as that of its neighbours is: those left outwards are examined from
+        outside, the others from inside.
+        """
+        leaving = [
+            (i, j, row.leaves) for i, rows in limits.items() for j, row in enumerate(rows) if row.leaves is not None
+        ]
+        outwards = [(i, j, leaves) for i, j, leaves in leaving if leaves[0] >= self._bounds[i, j]]
+        order = [*reversed(outwards), *(entry for entry in leaving if entry not in outwards)]
+        for _ in range(self._bounds.shape[1]):
+            before = self._bound_labels.copy()
+            for i, j, (low, high) in order:
+                if self._bound_labels[i, j] == UNDECIDED:
+                    self._bound_labels[i, j] = self._label_between(places[i] + low, places[i] + high)
+            if np.array_equal(self._bound_labels, before):
+                break
+
+
+_labels_for = functools.lru_cache(maxsize=16)(_Labels)
 
 
 def basin_grid(
@@ -172,7 +183,9 @@ def basin_grid(
     """Return x of shape (n,), v of shape (m,) and the basins of their grid, labels of shape (m, n).
 
     Args:
-        parameters: of the oscillator. x_limits, v_limits: of the grid, both ends included. shape: (n, m).
+        parameters: of the oscillator.
+        x_limits, v_limits: of the grid, both ends included, in [-10, 10].
+        shape: (n, m).
 
     Raises:
         ValueError: if limits are reversed or out of range, or the shape is not of whole numbers from 2 on.
@@ -180,23 +193,3 @@ def basin_grid(
     x, v = checked_grid(x_limits, v_limits, shape)
     grid_x, grid_v = np.meshgrid(x, v)
     return x, v, basins(parameters, grid_x, grid_v)
-
-
-def checked_grid(
-    x_limits: tuple[float, float], v_limits: tuple[float, float], shape: tuple[int, int]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the axes of a grid, x of shape (n,) and v of shape (m,).
-
-    Raises:
-        ValueError: if limits are reversed or out of range, or the shape is not of whole numbers from 2 on.
-    """
-    axes = []
-    for name, (low, high), count in zip(("x_limits", "v_limits"), (x_limits, v_limits), shape, strict=True):
-        low = checked_number(f"{name} low", low, -STATE_LIMIT, STATE_LIMIT)
-        high = checked_number(f"{name} high", high, -STATE_LIMIT, STATE_LIMIT)
-        if not low < high:
-            raise ValueError(f"{name} must have low < high, got {(low, high)}")
-        if count != int(count) or count < 2:
-            raise ValueError(f"shape must hold whole numbers from 2 on, got {shape}")
-        axes.append(np.linspace(low, high, int(count)))
-    return axes[0], axes[1]

@@ -1,6 +1,7 @@
 """Amplitude and frequency over the belt speed, as tidy tables."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -39,8 +40,8 @@ def checked_belt_speeds(belt_speeds: ArrayLike) -> NDArray[np.float64]:
     """Return belt speeds as an array of shape (n,).
 
     Raises:
-        TypeError: if they are no numbers.
-        ValueError: if there are none, or one is not in its range.
+        TypeError: if they are not numbers.
+        ValueError: if there is none, or one is not in [0, 10].
     """
     try:
         speeds = np.atleast_1d(np.asarray(belt_speeds, dtype=np.float64))
@@ -54,7 +55,7 @@ def checked_belt_speeds(belt_speeds: ArrayLike) -> NDArray[np.float64]:
 
 
 def _row(cycle: LimitCycle) -> dict[str, Any]:
-    """Return what a table says of a cycle and the start that reached it."""
+    """Return a table's row for a cycle and the start that reached it."""
     row = {name: getattr(cycle, name) for name in _CYCLE_COLUMNS}
     start = {"x_start": cycle.x_start, "v_start": cycle.v_start}
     return {"belt_speed": cycle.parameters.belt_speed} | row | start | {"note": ""}
@@ -73,8 +74,8 @@ def amplitude_curve(
     Args:
         parameters: of the oscillator; their belt speed is not used.
         belt_speeds: of shape (n,), each in [0, 10].
-        x, v: the start at every belt speed, in [-10, 10]; by default a mass set down at x = 0 moving with the belt.
-        progress: called with the rows done and the rows in all after each row.
+        x, v: the start at every belt speed, in [-10, 10]; by default a mass set down at x = 0 that moves with the belt.
+        progress: called with the number of rows done and their total after each row.
 
     Returns:
         A table with the columns belt_speed, kind ("stick-slip", "pure-slip", "steady-slip", "neutral", "rest" or
@@ -82,7 +83,7 @@ def amplitude_curve(
         x_restick, sticks, forward_arcs, floquet_multiplier, x_start, v_start and note (why a row failed, else empty).
 
     Raises:
-        TypeError, ValueError: if an argument is not as said.
+        TypeError, ValueError: if an argument is not of the type or in the range above.
     """
     speeds = checked_belt_speeds(belt_speeds)
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
@@ -134,11 +135,11 @@ def attractor_curves(
 
     Returns:
         The columns of :func:`amplitude_curve` and ``well``: "left" or "right" of the middle equilibrium, "only" where
-        there is one equilibrium, "both" for a motion round all of them. A belt speed without an attractor that keeps
+        there is one equilibrium, "both" for a motion about all of them. A belt speed without an attractor that keeps
         contact is one row of kind "failed".
 
     Raises:
-        TypeError, ValueError: if an argument is not as said.
+        TypeError, ValueError: if an argument is not of the type or in the range above.
     """
     speeds = checked_belt_speeds(belt_speeds)
     rows = []
@@ -148,10 +149,8 @@ def attractor_curves(
         places = [e.x for e in equilibria(plant)]
         rows += [_row(cycle) | {"well": _well(cycle, places)} for cycle in found]
         if not found:
-            rows.append(
-                _failed_row(speed, float("nan"), float("nan"), "no attractor that keeps contact was found")
-                | {"well": ""}
-            )
+            note = "no attractor that keeps contact was found"
+            rows.append(_failed_row(speed, math.nan, math.nan, note) | {"well": ""})
         if progress is not None:
             progress(done, len(speeds))
     return _table(rows, parameters)
@@ -165,7 +164,7 @@ def _well(cycle: LimitCycle, places: list[float]) -> str:
 
 
 def _failed_row(belt_speed: float, x: float, v: float, note: str) -> dict[str, Any]:
-    row: dict[str, Any] = dict.fromkeys(_CYCLE_COLUMNS, float("nan"))
+    row: dict[str, Any] = dict.fromkeys(_CYCLE_COLUMNS, math.nan)
     row |= {"kind": "failed", "sticks": 0, "forward_arcs": 0}
     return row | {"belt_speed": belt_speed, "x_start": x, "v_start": v, "note": note}
 
@@ -177,5 +176,5 @@ def _table(rows: list[dict[str, Any]], parameters: OscillatorParameters) -> Tabl
 
 
 def cycle_table(columns: dict[str, Any], parameters: OscillatorParameters) -> Table:
-    """Return columns of cycles as a table that tells the oscillator."""
+    """Return columns of cycles as a table with the oscillator in its metadata."""
     return Table(columns, {"parameters": dataclasses.asdict(parameters)})

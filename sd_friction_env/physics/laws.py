@@ -1,4 +1,4 @@
-"""Laws of one's own: springs and friction laws as NamedTuple classes, friction tables, and checks of their derivatives.
+"""User-defined laws: springs and friction laws as NamedTuple classes, friction tables, and checks of derivatives.
 
 A law is a NamedTuple class with the methods that :func:`friction_law` or :func:`spring_law` name. An instance of it is
 given to :class:`OscillatorParameters` as ``friction`` or ``geometry``, and works wherever a built-in law does.
@@ -72,7 +72,8 @@ def tabulated_friction(speeds: ArrayLike, coefficients: ArrayLike) -> Tabulated:
         coefficients: of friction, (n,), none below 0.
 
     Raises:
-        TypeError: if they are not numbers. ValueError: if they are not as said, naming the place.
+        TypeError: if they are not numbers.
+        ValueError: if they do not ascend from 0 or are negative; names the point.
     """
     w, mu = _column("speeds", speeds), _column("coefficients", coefficients)
     if len(w) != len(mu):
@@ -96,10 +97,11 @@ def tabulated_friction(speeds: ArrayLike, coefficients: ArrayLike) -> Tabulated:
 def friction_table(path: str | Path) -> Tabulated:
     """Return :func:`tabulated_friction` of a CSV file: a speed and a coefficient in each line.
 
-    Empty lines and those that begin with ``#`` are skipped, and one line of names at the top.
+    Skipped: empty lines, lines that begin with ``#``, and one line of names at the top.
 
     Raises:
-        OSError: if the file cannot be read. ValueError: if a line is not two numbers, or the curve is no friction law.
+        OSError: if the file cannot be read.
+        ValueError: if a line is not two numbers, or the curve is no friction law.
     """
     rows: list[tuple[float, float]] = []
     with Path(path).open(newline="", encoding="utf-8") as file:
@@ -179,9 +181,9 @@ def _checked(
 
 @functools.lru_cache(maxsize=1024)
 def check_friction_law(law: Any) -> None:
-    """Check that a friction law is finite, no stronger in slip than in stick at v_rel = 0, and compare its derivatives.
+    """Check that a friction law is finite, at v_rel = 0 no stronger in slip than in stick, and has right derivatives.
 
-    They are compared with differences, in both modes, at speeds from 0.01 to 5.
+    Derivatives are compared with finite differences, in both modes, at speeds from 0.01 to 5.
 
     Raises:
         ValueError: names the law, the method, the place, the value and what it should be.
@@ -194,7 +196,7 @@ def check_friction_law(law: Any) -> None:
 
 @functools.lru_cache(maxsize=1024)
 def check_spring_law(law: Any) -> None:
-    """Check that a spring is finite, and compare its derivatives with differences, at places within 2 of x = 0.
+    """Check that a spring is finite and has right derivatives, by finite differences at |x| <= 2.
 
     Raises:
         ValueError: names the law, the method, the place, the value and what it should be.
@@ -216,7 +218,7 @@ def _check_stick(law: Any) -> None:
         if not slip <= limit * (1.0 + 1e-12):
             raise ValueError(
                 f"{_name(law)}.coefficient({mode}, 0.0) must not exceed breakaway_coefficient({mode}) = {limit!r} in "
-                f"size, got {slip!r}: what slips could not come to rest"
+                f"size, got {slip!r}: a slipping mass could not come to rest"
             )
 
 
@@ -257,7 +259,7 @@ def _check_chain(law: Any, chain: tuple[str, ...], value: Callable[[str, float],
         far, near = ((value(method, at + step) - value(method, at - step)) / (2.0 * step) for step in (2.0 * h, h))
         difference = (4.0 * near - far) / 3.0
         found = value(derivative, at)
-        # A kink between the points makes the two differences differ, and nothing is said then.
+        # A kink between the points makes the two differences differ: then the comparison decides nothing.
         allowed = _RELATIVE_ERROR * (abs(difference) + abs(value(method, at))) + abs(near - far) + 1e-7
         if abs(found - difference) > allowed:
             raise ValueError(

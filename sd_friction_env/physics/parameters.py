@@ -1,4 +1,4 @@
-"""The oscillator's parameters as a person types them: checked, frozen, and convertible from a rig in SI units."""
+"""The oscillator's parameters: checked, immutable, and convertible from a rig in SI units."""
 
 import dataclasses
 import functools
@@ -60,7 +60,8 @@ def checked_count(name: str, value: Any, low: int, high: int) -> int:
     """Return ``value`` as an int.
 
     Raises:
-        TypeError: if it is not a real number. ValueError: if it is not whole or not in [low, high].
+        TypeError: if it is not a real number.
+        ValueError: if it is not whole or not in [low, high].
     """
     number = checked_number(name, value, low, high)
     if number != int(number):
@@ -71,7 +72,7 @@ def checked_count(name: str, value: Any, low: int, high: int) -> int:
 def brief_repr(value: Any) -> str:
     """Return ``repr(value)`` for an error message, shortened where it is long.
 
-    Whole numbers have no greatest: Python refuses to write one of more than 4,300 digits.
+    Python refuses to write whole numbers of more than 4,300 digits.
     """
     try:
         text = repr(value)
@@ -110,7 +111,7 @@ class OscillatorParameters:
     Attributes:
         geometry: "exact" (R and N of Eq. 4), "cubic" (their Taylor polynomials, Eq. 9: what the paper's figures show),
             "linear" (R = x, N = g1: the belt of Thomsen and Fidlin), "duffing" (R = linear_stiffness x + kappa x^3,
-            N = g1), or a spring of your own (:func:`spring_law`).
+            N = g1), or a user-defined spring (:func:`spring_law`).
         alpha: height of the spring's anchor over the belt, H/L, in [0.001, 10]; unused by "linear" and "duffing". With
             "exact" also 0, the discontinuous limit R = x - sgn(x), N = g1: x = 0 switches the spring's force, which a
             mass that moves meets as on the side it moves to, and one at rest there as 0.
@@ -125,8 +126,8 @@ class OscillatorParameters:
         force_scale: newtons per unit of force, K L (1 unless made by :meth:`from_physical`).
         friction: "stribeck" (Eq. 5, with mu_s, mu_m and v_m), "coulomb" (two levels: mu_s for stick, mu_k for slip),
             "hyperbolic" (mu_s/(1 + delta |w|) and mu_v w, w the relative velocity), "exponential"
-            (mu_k + (mu_s - mu_k) exp(-|w|/v_0), and mu_v w), "gaussian" (the same with exp(-(w/v_0)^2)), or a law of
-            its own: :func:`tabulated_friction`, :class:`Asymmetric`, or one of yours (:func:`friction_law`).
+            (mu_k + (mu_s - mu_k) exp(-|w|/v_0), and mu_v w), "gaussian" (the same with exp(-(w/v_0)^2)), or a law
+            object: :func:`tabulated_friction`, :class:`Asymmetric`, or a user-defined one (:func:`friction_law`).
         mu_k: kinetic friction coefficient of "coulomb", least one of "exponential" and "gaussian", in [0, mu_s] where
             used.
         delta: of "hyperbolic", in [0, 1000].
@@ -141,7 +142,7 @@ class OscillatorParameters:
         force_phase, ripple_phase, stiffness_phase: at t = 0, in radians, in [-10, 10].
 
     Raises:
-        TypeError: if a value is not of the kind said above.
+        TypeError: if a value is not of the type above.
         ValueError: if a value lies outside its range.
     """
 
@@ -216,17 +217,17 @@ class OscillatorParameters:
             g: acceleration of gravity (or the load that presses the mass on the belt, over M), m/s^2.
             V0: belt speed, m/s.
             mu_s, mu_m: friction coefficients. V_m: relative speed at which friction is least, m/s.
-            geometry, friction: as in the class; the numbers of laws of your own are in SI units.
-            numbers: what else the laws need. ``mu_k``; ``V_0``, m/s; ``delta``, s/m; ``mu_v``, s/m (0 if not given);
+            geometry, friction: as in the class; the numbers of user-defined laws are in SI units.
+            numbers: others that the laws need. ``mu_k``; ``V_0``, m/s; ``delta``, s/m; ``mu_v``, s/m (0 if not given);
                 ``K3``, the cubic stiffness of "duffing", N/m^3; ``linear_stiffness``, over K (1 if not given);
                 ``force_amplitude``, N; ``ripple_amplitude``, m/s; ``stiffness_amplitude``; each with ``_frequency``,
                 rad/s, and ``_phase``.
 
-        The results' ``time_scale``, ``length_scale`` and ``force_scale`` lead back: t = time_scale tau,
+        The result's ``time_scale``, ``length_scale`` and ``force_scale`` convert back to SI units: t = time_scale tau,
         X = length_scale x, dX/dt = length_scale / time_scale x', F = force_scale u.
 
         Raises:
-            TypeError: if a number that the laws need is not given, or one has no such name.
+            TypeError: if a number that the laws need is missing, or a name is unknown.
             ValueError: as the class does; M, K, L, g, V_m and V_0 must be positive.
         """
         given = {"mu_m": mu_m, "V_m": V_m, **numbers}
@@ -277,7 +278,7 @@ class OscillatorParameters:
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some values changed, checked anew.
 
-        Numbers of a law of one's own are named ``friction.name`` and ``geometry.name``:
+        Numbers of a user-defined law are named ``friction.name`` and ``geometry.name``:
         ``p.replace(**{"friction.mu_s": 0.3})``.
         """
         unknown = set(changes) - {field.name for field in dataclasses.fields(self)} - set(self.law_numbers)
@@ -323,7 +324,7 @@ class OscillatorParameters:
 
     @functools.cached_property
     def law_numbers(self) -> dict[str, float]:
-        """The numbers of laws of one's own, as ``friction.name`` and ``geometry.name``."""
+        """The numbers of user-defined laws, as ``friction.name`` and ``geometry.name``."""
         numbers: dict[str, float] = {}
         for part in ("geometry", "friction"):
             law = getattr(self, part)
@@ -334,7 +335,7 @@ class OscillatorParameters:
 
     @functools.cached_property
     def values(self) -> dict[str, float]:
-        """All numbers by name, those of laws of one's own too."""
+        """All numbers by name, including those of user-defined laws."""
         return {name: getattr(self, name) for name in RANGES} | self.law_numbers
 
     @functools.cached_property
@@ -345,11 +346,11 @@ class OscillatorParameters:
 
     @functools.cached_property
     def plant(self) -> Plant:
-        """The values that compiled code takes."""
+        """The plant in the form that compiled code takes."""
         return plant_of(self.kind, self.values)
 
     def excited_plant(self, time: float) -> Plant:
-        """The values that compiled code takes at a time; those of an excitation even if there is none."""
+        """Return the plant in its excited form at a time, even if its amplitudes are 0."""
         plant = plant_of(self.kind._replace(excited=True), self.values)
         return plant._replace(excitation=plant.excitation._replace(time=time))
 
@@ -402,13 +403,13 @@ _SI_NUMBERS = {  # of a rig, by their names in SI units: the field, and what it 
 class Kind(NamedTuple):
     """The laws of a plant without their numbers."""
 
-    geometry: Any  # a name, or a spring of one's own with zeros; "discontinuous" for alpha = 0
-    friction: Any  # a name, or a law of one's own with zeros
+    geometry: Any  # a name, or a user-defined spring with zeros; "discontinuous" for alpha = 0
+    friction: Any  # a name, or a user-defined law with zeros
     excited: bool
 
 
 def _floats(law: Any) -> Any:
-    """Return a law with floats for whole numbers, for which numba would compile it once more."""
+    """Return a law with floats for whole numbers, which numba would compile a second time."""
     if isinstance(law, str):
         return law
     values = (_floats(value) if isinstance(value, tuple) else value for value in law)
@@ -420,7 +421,7 @@ def _blank(law: Any) -> Any:
 
 
 def _with_numbers(law: Any, prefix: str, values: Mapping[str, Any]) -> Any:
-    """Return a law with the numbers that ``values`` has under its fields' names, after a prefix."""
+    """Return a law with the numbers that ``values`` holds under its fields' names, after a prefix."""
     fields = {}
     for name, value in zip(law._fields, law, strict=True):
         nested = isinstance(value, tuple)

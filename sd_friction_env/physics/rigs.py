@@ -1,4 +1,4 @@
-"""Rig files: a machine's numbers in SI units, in TOML or YAML."""
+"""Rig files: parameters of a machine in SI units, in TOML or YAML."""
 
 import tomllib
 from pathlib import Path
@@ -12,14 +12,15 @@ def read_rig(path: str | Path) -> OscillatorParameters:
     """Return the dimensionless parameters of a rig described in a file.
 
     Its entries are the arguments of :meth:`OscillatorParameters.from_physical` (M, K, C, L, ..., in SI units), and
-    ``friction_table``, the name of a CSV file of speeds (m/s) and coefficients, beside the rig file.
+    ``friction_table``, the name of a CSV file of speeds (m/s) and coefficients in the same folder.
 
     Args:
         path: a file whose name ends in .toml, .yaml or .yml.
 
     Raises:
-        OSError: if the file, or its table, cannot be read. ImportError: if PyYAML is missing for YAML.
-        ValueError: if it is not a list of names and values, or they make no rig; names the file.
+        OSError: if the file, or its table, cannot be read.
+        ImportError: if PyYAML is missing for YAML.
+        ValueError: if it does not hold names and values, or they make no rig; names the file.
     """
     path = Path(path)
     entries = _entries(path)

@@ -1,4 +1,4 @@
-"""One history in time: samples, events and energy of the oscillator from a start, passive or driven."""
+"""Simulation in time: samples, events and energy balance of one motion, passive or driven."""
 
 import math
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _CHUNK = 4096
 
 
 def amplitude(x_min: float, x_max: float) -> float:
-    """Return the amplitude of a motion between two extremes: half their distance."""
+    """Return the amplitude of a motion with these extremes: half their distance."""
     return 0.5 * (x_max - x_min)
 
 
@@ -25,7 +25,7 @@ class Event(NamedTuple):
 
     Kinds: "restick" (slip ends in stick), "crossing" (v_rel changes sign without sticking), "grazing" (v_rel touches
     zero), "breakaway" (stick ends), "switching" (x passes 0 where alpha = 0), "contact-loss" (N falls to zero; the
-    history ends).
+    motion ends).
     """
 
     time: float
@@ -36,13 +36,14 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class EnergyBalance:
-    """Where the energy went: change = damping + contact + control + excitation, each a work done on the mass.
+    """Energy balance: change = damping + contact + control + excitation, each a work done on the mass.
 
     Attributes:
-        change: of x'^2/2 + V(x). damping: -2 beta times the integral of x'^2. contact: work of the contact force.
-        control: work of the control force. excitation: work of the exciting force and of what modulates the stiffness.
-        residual: change minus the rest. relative_residual: the residual over the sum of the absolute works (0 if
-            nothing moved).
+        change: of x'^2/2 + V(x).
+        damping: -2 beta times the integral of x'^2.
+        contact: work of the contact force.
+        control: work of the control force.
+        excitation: work of the exciting force and of the modulated stiffness.
     """
 
     change: float
@@ -53,19 +54,19 @@ class EnergyBalance:
 
     @property
     def residual(self) -> float:
-        """The part of the change that no work explains; zero but for integration errors."""
+        """The change minus all works: zero up to integration errors."""
         return self.change - self.damping - self.contact - self.control - self.excitation
 
     @property
     def relative_residual(self) -> float:
-        """The residual over the sum of the absolute works."""
+        """The residual over the sum of the absolute works; 0 if nothing moved."""
         works = abs(self.damping) + abs(self.contact) + abs(self.control) + abs(self.excitation)
         return abs(self.residual) / works if works > 0.0 else 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """A history of the oscillator (dimensionless).
+    """A motion of the oscillator in time (dimensionless).
 
     Attributes:
         t, x, v, v_belt: samples, each of shape (n,); the last is at t_end exactly, unless ``status`` is not "ok".
@@ -73,7 +74,7 @@ class Trajectory:
         events: changes of mode, in order of time.
         stick_time: time spent stuck.
         energy: the energy balance.
-        status: "ok", "contact lost", "event limit" or "step limit"; the history ends where it stopped being "ok".
+        status: "ok", "contact lost", "event limit" or "step limit"; the samples end where it stops being "ok".
         parameters: of the oscillator.
     """
 
@@ -119,19 +120,19 @@ def simulate(
     belt_acceleration: float | ArrayLike = 0.0,
     hold: float | None = None,
 ) -> Trajectory:
-    """Follow the oscillator from (x, v) at t = 0 to t_end.
+    """Simulate the oscillator from (x, v) at t = 0 to t_end, with its events located exactly.
 
     Args:
         parameters: of the oscillator; the belt starts at ``parameters.belt_speed``.
         x, v: the start, in [-10, 10]; v defaults to the belt speed, ripple included.
-        t_end: when to end, in [0, 1e7].
+        t_end: end time, in [0, 1e7].
         dt: time between samples, in [1e-6, 1e6].
         force: control force u: a number, or values of shape (m,), each held for ``hold``.
         belt_acceleration: of the belt, likewise.
-        hold: how long each value of an array is held; needed with arrays, which must cover t_end.
+        hold: duration of each value of an array, in [1e-6, 1e7]; needed with arrays, which must cover t_end.
 
     Raises:
-        TypeError, ValueError: if an argument is not as said.
+        TypeError, ValueError: if an argument is not of the type or in the range above.
     """
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
     v = parameters.first_belt_speed if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
@@ -141,110 +142,119 @@ def simulate(
         raise ValueError(
             f"dt = {dt!r} makes more than {_MOST_SAMPLES} samples up to t_end = {t_end!r}; take a longer dt"
         )
-    forces = _held_values("force", force)
-    accelerations = _held_values("belt_acceleration", belt_acceleration)
+    forces, accelerations = _held_values("force", force), _held_values("belt_acceleration", belt_acceleration)
+    hold = _checked_hold(hold, t_end, {"force": forces, "belt_acceleration": accelerations})
     segments = max(forces.size, accelerations.size)
-    if segments == 1:
-        hold = t_end
-    elif hold is None:
-        raise ValueError("hold must be given with an array of forces or belt accelerations: how long each is held")
-    else:
-        hold = checked_number("hold", hold, 1e-6, 1e7)
-        for name, values in (("force", forces), ("belt_acceleration", accelerations)):
-            if values.size > 1 and values.size * hold < t_end * (1.0 - 1e-12):
-                raise ValueError(
-                    f"{name} has {values.size} values held {hold!r} each, too few to reach t_end = {t_end!r}"
-                )
-
-    plant = parameters.plant
-    belt = parameters.belt_speed
-    grid = dt * np.arange(math.floor(t_end / dt * (1.0 + 1e-12)) + 1)
+    grid: NDArray[Any] = dt * np.arange(math.floor(t_end / dt * (1.0 + 1e-12)) + 1)
     grid = np.append(grid[grid < t_end * (1.0 - 1e-12)], t_end) if t_end > 0.0 else np.zeros(1)
-    start_energy = 0.5 * v * v + kernel.energy_in_spring(plant, x)
-    parts = [
-        np.array(
-            [
-                [
-                    0.0,
-                    x,
-                    v,
-                    belt,
-                    kernel.mode_of(plant, kernel.State(x, v), kernel.Drive(belt, accelerations[0], forces[0])),
-                ]
-            ]
-        )
-    ]
-    events: list[Event] = []
-    damping = contact = control = excitation = stick_time = 0.0
-    status = kernel.OK
+    run = _Run(parameters, x, v, float(forces[0]), float(accelerations[0]))
     segment, begin = 0, 0.0
-    mode, u, a_belt = kernel.UNKNOWN, 0.0, 0.0
-    while begin < t_end and status == kernel.OK:
+    while begin < t_end and run.status == kernel.OK:
         end = t_end if segment + 1 >= segments else min(t_end, (segment + 1) * hold)
-        before = u, a_belt
         u = float(forces[min(segment, forces.size - 1)])
         a_belt = float(accelerations[min(segment, accelerations.size - 1)])
-        if (u, a_belt) != before:
-            mode = kernel.UNKNOWN  # the drive has jumped
         inside = grid[(np.searchsorted(grid, begin, "right")) : np.searchsorted(grid, end, "right")]
+        run.advance(begin, end, u, a_belt, inside)
+        segment, begin = segment + 1, end
+    return run.trajectory()
+
+
+class _Run:
+    """A simulation in progress: the state, and what has been recorded and integrated so far."""
+
+    def __init__(self, parameters: OscillatorParameters, x: float, v: float, u: float, a_belt: float) -> None:
+        self.parameters, self.plant = parameters, parameters.plant
+        self.x, self.v, self.belt = x, v, parameters.belt_speed
+        self.status, self.mode, self.drive = kernel.OK, kernel.UNKNOWN, (0.0, 0.0)
+        self.start_energy = 0.5 * v * v + kernel.energy_in_spring(self.plant, x)
+        mode = kernel.mode_of(self.plant, kernel.State(x, v), kernel.Drive(self.belt, a_belt, u))
+        self.parts = [np.array([[0.0, x, v, self.belt, mode]])]
+        self.events: list[Event] = []
+        self.damping = self.contact = self.control = self.excitation = self.stick_time = 0.0
+
+    def advance(self, begin: float, end: float, u: float, a_belt: float, inside: NDArray[np.float64]) -> None:
+        """Advance from ``begin`` to ``end`` under one drive, with samples at the times ``inside``."""
+        if (u, a_belt) != self.drive:
+            self.mode = kernel.UNKNOWN  # the drive has jumped
+        self.drive = u, a_belt
         times = inside - begin
-        extra = not inside.size or inside[-1] < end
+        extra = not inside.size or inside[-1] < end  # then the end is not a sample
         if extra:
             times = np.append(times, end - begin)
-        done, x_begin = 0, x
-        t0, belt0 = begin, belt
-        while done < times.size and status == kernel.OK:
+        done, x_begin, t0 = 0, self.x, begin
+        while done < times.size and self.status == kernel.OK:
             piece = times[done : done + _CHUNK] - (t0 - begin)
-            samples = np.empty((piece.size, 4))
-            buffer = np.empty((max(4 * kernel.MAX_EVENTS, piece.size), 4))
-            now = kernel.at_time(plant, t0)
-            taken, n_events, status, reached, int_v2, stuck, int_fv = kernel.trace(
-                now, mode, kernel.State(x, v), kernel.Drive(belt0, a_belt, u), piece, samples, buffer
-            )
-            if parameters.excited:
-                excitation += kernel.excitation_work(
-                    now, kernel.State(x, v), kernel.Drive(belt0, a_belt, u), reached, buffer[:n_events]
-                )
-            events += [Event(t0 + e[0], kernel.EVENT_NAMES[int(e[1])], e[2], e[3]) for e in buffer[:n_events].tolist()]
-            damping -= 2.0 * parameters.beta * int_v2
-            contact += int_fv
-            stick_time += stuck
-            x, v, belt0, last_mode = samples[taken - 1].tolist()
-            mode = int(last_mode)
+            samples, reached = self._trace(t0, piece)
+            taken = len(samples)
             stamps = t0 + piece[:taken]
-            if status != kernel.OK:
+            at_end = done + taken == times.size
+            if self.status != kernel.OK:
                 stamps[-1] = t0 + reached
-            elif done + taken == times.size:
+            elif at_end:
                 stamps[-1] = end
-            keep = taken - 1 if extra and status == kernel.OK and done + taken == times.size else taken
-            parts.append(np.column_stack((stamps[:keep], samples[:keep])))
+            keep = taken - 1 if extra and self.status == kernel.OK and at_end else taken
+            self.parts.append(np.column_stack((stamps[:keep], samples[:keep])))
             t0 = float(stamps[-1])
             done += taken
-        belt = belt0
-        control += u * (x - x_begin)
-        segment, begin = segment + 1, end
-    table = np.concatenate(parts)
-    if parameters.ripple_amplitude > 0.0:
-        angles = parameters.ripple_frequency * table[:, 0] + parameters.ripple_phase
-        table[:, 3] += parameters.ripple_amplitude * np.cos(angles)
-    return Trajectory(
-        t=table[:, 0],
-        x=table[:, 1],
-        v=table[:, 2],
-        v_belt=table[:, 3],
-        mode=table[:, 4].astype(np.int8),
-        events=tuple(events),
-        stick_time=stick_time,
-        energy=EnergyBalance(
-            change=0.5 * v * v + kernel.energy_in_spring(kernel.at_time(plant, float(table[-1, 0])), x) - start_energy,
-            damping=damping,
-            contact=contact,
-            control=control,
-            excitation=excitation,
-        ),
-        status=kernel.STATUS_NAMES[status],
-        parameters=parameters,
-    )
+        self.control += u * (self.x - x_begin)
+
+    def _trace(self, t0: float, piece: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+        """Advance through a piece of sample times, counted from t0; return the samples taken and the time reached."""
+        u, a_belt = self.drive
+        state, drive = kernel.State(self.x, self.v), kernel.Drive(self.belt, a_belt, u)
+        samples = np.empty((piece.size, 4))
+        buffer = np.empty((max(4 * kernel.MAX_EVENTS, piece.size), 4))
+        now = kernel.at_time(self.plant, t0)
+        taken, n_events, self.status, reached, int_v2, stuck, int_fv = kernel.trace(
+            now, self.mode, state, drive, piece, samples, buffer
+        )
+        if self.parameters.excited:
+            self.excitation += kernel.excitation_work(now, state, drive, reached, buffer[:n_events])
+        self.events += [Event(t0 + e[0], kernel.EVENT_NAMES[int(e[1])], e[2], e[3]) for e in buffer[:n_events].tolist()]
+        self.damping -= 2.0 * self.parameters.beta * int_v2
+        self.contact += int_fv
+        self.stick_time += stuck
+        self.x, self.v, self.belt, mode = samples[taken - 1].tolist()
+        self.mode = int(mode)
+        return samples[:taken], reached
+
+    def trajectory(self) -> Trajectory:
+        """Return what was recorded."""
+        p, table = self.parameters, np.concatenate(self.parts)
+        if p.ripple_amplitude > 0.0:
+            table[:, 3] += p.ripple_amplitude * np.cos(p.ripple_frequency * table[:, 0] + p.ripple_phase)
+        in_spring = kernel.energy_in_spring(kernel.at_time(self.plant, float(table[-1, 0])), self.x)
+        return Trajectory(
+            t=table[:, 0],
+            x=table[:, 1],
+            v=table[:, 2],
+            v_belt=table[:, 3],
+            mode=table[:, 4].astype(np.int8),
+            events=tuple(self.events),
+            stick_time=self.stick_time,
+            energy=EnergyBalance(
+                change=0.5 * self.v * self.v + in_spring - self.start_energy,
+                damping=self.damping,
+                contact=self.contact,
+                control=self.control,
+                excitation=self.excitation,
+            ),
+            status=kernel.STATUS_NAMES[self.status],
+            parameters=p,
+        )
+
+
+def _checked_hold(hold: float | None, t_end: float, drives: dict[str, NDArray[np.float64]]) -> float:
+    """Return how long each value of the drives is held."""
+    if max(values.size for values in drives.values()) == 1:
+        return t_end
+    if hold is None:
+        raise ValueError("hold must be given with an array of forces or belt accelerations: the duration of each value")
+    hold = checked_number("hold", hold, 1e-6, 1e7)
+    for name, values in drives.items():
+        if values.size > 1 and values.size * hold < t_end * (1.0 - 1e-12):
+            raise ValueError(f"{name} has {values.size} values held {hold!r} each, too few to reach t_end = {t_end!r}")
+    return hold
 
 
 def _held_values(name: str, values: Any) -> NDArray[np.float64]:

@@ -49,13 +49,13 @@ def contact_normal_force(X: Real, M: float, g: float, K: float, H: float, L: flo
 
 
 def exact_wells(alpha: float) -> tuple[float, ...]:
-    """Where Eq. 4's spring is at rest: +-sqrt(1 - alpha^2) below alpha = 1, else 0."""
+    """Rest positions of Eq. 4's spring: +-sqrt(1 - alpha^2) below alpha = 1, else 0."""
     well = math.sqrt(max(0.0, 1.0 - alpha * alpha))
     return (-well, well) if well > 0.0 else (0.0,)
 
 
 def cubic_wells(alpha: float) -> tuple[float, ...]:
-    """Where Eq. 9's spring is at rest: +-alpha sqrt(2 (1 - alpha)) below alpha = 1, else 0."""
+    """Rest positions of Eq. 9's spring: +-alpha sqrt(2 (1 - alpha)) below alpha = 1, else 0."""
     well = alpha * math.sqrt(max(0.0, 2.0 * (1.0 - alpha)))
     return (-well, well) if well > 0.0 else (0.0,)
 
@@ -87,7 +87,7 @@ def stick_condition(load: Real, mu_s: float, normal_force: Real) -> bool | npt.N
 def stick_condition_printed(load: Real, mu_s: float) -> bool | npt.NDArray[np.bool_]:
     """load <= mu_s, Eqs. 8, 10 and 15 as printed.
 
-    It forgets N, so the force jumps at release, and the modulus, so the belt holds against any push along its motion.
+    Without N the force jumps at release; without the modulus the belt holds against any push along its motion.
     """
     return load <= mu_s
 
@@ -108,7 +108,7 @@ def equilibrium_x(alpha: float, g1: float, D: float) -> float:
 
         A = -alpha^3 D (D^2 - 27 g1 - 18) - 18 alpha^4 D
 
-    Below alpha about .5 the radicand is negative: there are three equilibria, the cube root is complex, and its
+    Below alpha about 0.5 the radicand is negative: there are three equilibria, the cube root is complex, and its
     principal value gives the rightmost one.
     """
     a = alpha
@@ -181,7 +181,7 @@ def linear_breakaway_x(v_b: Real, mu_s: float, g1: float, beta: float) -> Real:
 def linear_hopf_belt_speed(mu_s: float, mu_m: float, v_m: float, beta: float, g1: float = 1.0) -> float:
     """v_b1 = v_m sqrt(1 - 4 beta v_m/(3 g1 (mu_s - mu_m))), exact on the linear belt; NaN where nothing oscillates.
 
-    Thomsen and Fidlin (2003), as are the three functions below.
+    Source: Thomsen and Fidlin (2003), also for the three functions below.
     """
     difference = mu_s - mu_m
     square = 1.0 - 4.0 * beta * v_m / (3.0 * g1 * difference) if difference > 0.0 else -1.0
@@ -199,7 +199,7 @@ def pure_slip_amplitude(v_b: Real, v_b1: float, frequency: float = 1.0) -> Real:
 
 
 def grazing_belt_speed_first_order(v_b1: float) -> float:
-    """v_b0 ~ sqrt(4/5) v_b1, where A1's velocity reaches the belt's: first order, .35% low on the nominal one."""
+    """v_b0 ~ sqrt(4/5) v_b1, where A1's velocity reaches the belt's: first order, 0.35% low on the nominal one."""
     return math.sqrt(0.8) * v_b1
 
 
@@ -233,12 +233,12 @@ def coulomb_two_level_amplitude(v_b: Real, difference: float) -> Real:
 
 
 def coulomb_rest_x(x: float, v: float, friction: float = 1.0) -> float:
-    """Where x'' + x = -friction sgn(x') comes to rest, exact.
+    """Position at which x'' + x = -friction sgn(x') comes to rest, exact.
 
     Half circles about -+friction follow each other until one ends with |x| <= friction.
     """
     if friction <= 0.0:
-        raise ValueError("without friction it never rests")
+        raise ValueError(f"friction must be positive for the mass to come to rest, got {friction!r}")
     if v != 0.0:
         sign = math.copysign(1.0, v)
         x = -sign * friction + sign * math.hypot(x + sign * friction, v)

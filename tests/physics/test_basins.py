@@ -19,7 +19,7 @@ from sd_friction_env import (
     slip_cycles,
     stick_intervals,
 )
-from sd_friction_env.physics.basins import _classifier, basin_grid, basins
+from sd_friction_env.physics.basins import _labels_for, basin_grid, basins
 from sd_friction_env.physics.forced import lyapunov_exponent
 from sd_friction_env.physics.orbits import ContactLossError, ReturnMap, same_motion
 
@@ -181,7 +181,7 @@ def test_what_creeps_into_a_node_is_steady_slip_and_keeps_contact(parameters, st
 
 
 def test_an_exit_that_leads_nowhere_known_is_undecided_and_one_off_the_belt_lost(monkeypatch):
-    monkeypatch.setattr("sd_friction_env.physics.basins._classifier", _classifier.__wrapped__)  # past its cache
+    monkeypatch.setattr("sd_friction_env.physics.basins._labels_for", _labels_for.__wrapped__)  # past its cache
     for error, label in ((OrbitError("no"), -2), (ContactLossError("off"), -1)):
 
         def fail(*_, error=error):

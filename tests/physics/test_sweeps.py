@@ -17,7 +17,6 @@ import pytest
 
 from sd_friction_env import OscillatorParameters, amplitude_curve, attractor_curves, basin_grid
 from sd_friction_env.cli import main as cli
-from sd_friction_env.physics import sweeps
 from sd_friction_env.physics.sweeps import Engine, SweepError, amplitude_sweep, basin_sweep, run_chunks
 
 TWO_WELLS = OscillatorParameters(alpha=0.2)
@@ -419,7 +418,7 @@ def test_workers_that_are_lost_again_and_again_are_given_up(monkeypatch):
         raise LostError("killed")
         yield
 
-    monkeypatch.setattr(sweeps, "_worker_losses", lambda backend: (LostError,))
-    monkeypatch.setattr(sweeps, "_workers", lambda engine: contextlib.nullcontext(lose))
+    monkeypatch.setattr("sd_friction_env.physics.chunks._worker_losses", lambda backend: (LostError,))
+    monkeypatch.setattr("sd_friction_env.physics.chunks._workers", lambda engine: contextlib.nullcontext(lose))
     with pytest.raises(SweepError, match=r"lost 3 times with no chunk finished between; the last time: killed"):
         run_chunks(double, [[1.0]], Engine(), description={})

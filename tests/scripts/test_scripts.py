@@ -68,8 +68,8 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
     assert "cannot write into --out" in run.stderr
 
 
-def test_the_reference_numbers_are_within_their_bounds():
-    assert "all within bounds" in script("reference_numbers.py").stdout
+def test_the_numbers_that_verify_prints_are_within_their_bounds():
+    assert "all within bounds" in script("verify.py").stdout
 
 
 @pytest.mark.parametrize("block", re.findall(r"```python\n(.*?)```", README, re.S))

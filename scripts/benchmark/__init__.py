@@ -1,0 +1,1 @@
+"""The benchmark: what is timed, by subject, and the program (`python scripts/benchmark`)."""

@@ -1,0 +1,136 @@
+"""Bifurcation diagrams: section points over a parameter, each value continued from the one before."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sd_friction_env import kernel
+from sd_friction_env.physics.forced.exponents import BATCHES, LyapunovExponent, exponent_of, lyapunov_exponent
+from sd_friction_env.physics.forced.sections import (
+    MOST_CYCLES,
+    Stroboscope,
+    active_excitations,
+    checked_period,
+    common_period,
+    lost_motion,
+)
+from sd_friction_env.physics.orbits import OrbitError, traps_of
+from sd_friction_env.physics.parameters import RANGES, OscillatorParameters, checked_choice, checked_count
+from sd_friction_env.physics.tables import Table
+from sd_friction_env.physics.theory import FloatArray
+
+Direction = Literal["up", "down", "both"]
+
+
+def bifurcation_diagram(
+    parameters: OscillatorParameters,
+    name: str,
+    values: ArrayLike,
+    *,
+    direction: Direction = "up",
+    cycles: int = 100,
+    transient: int = 200,
+    x: float = 0.0,
+    v: float | None = None,
+    lyapunov: bool = False,
+    period: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Table:
+    """Return section points over a parameter, each value starting from the last state of the one before.
+
+    Under excitation the section is stroboscopic, at phase 0. Without it, it is the maxima of x (v = 0 there), each
+    counted as one cycle; a motion that comes to rest fills its rows with that place.
+
+    Args:
+        parameters: of the oscillator; the value of ``name`` is not used.
+        name: of a number among the parameters.
+        values: of shape (n,), in any order.
+        direction: "up" takes them ascending, "down" descending, "both" up and then, from there, down.
+        cycles: rows of each value, from 1 on (20 with ``lyapunov``).
+        transient: cycles followed before, from 0 on.
+        x, v: the start at the first value, and again after a value at which the mass loses contact.
+        lyapunov: whether to add the largest exponent of each value.
+        period: time between sections; by default that of the excitation at each value.
+        progress: called with the number of values done and their total after each.
+
+    Returns:
+        A table with the columns value, direction ("up" or "down"), cycle, x, v, stick_fraction (NaN without
+        excitation), and with ``lyapunov`` exponent and standard_error. A value at which the mass loses contact is one
+        row with x = v = NaN.
+
+    Raises:
+        TypeError, ValueError: if an argument is not of the type or in the range above.
+    """
+    checked_choice("name", name, tuple(RANGES))
+    checked_choice("direction", direction, get_args(Direction))
+    cycles = checked_count("cycles", cycles, BATCHES if lyapunov else 1, MOST_CYCLES)
+    transient = checked_count("transient", transient, 0, MOST_CYCLES)
+    Stroboscope(parameters, 0.0).checked_start(x, v)
+    try:
+        numbers = np.unique(np.asarray(values, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise TypeError(f"values must be numbers, got {values!r}") from None
+    if np.ndim(values) != 1 or not numbers.size:
+        raise ValueError(f"values must have shape (n,) with n >= 1, got shape {np.shape(values)}")
+    plants = [parameters.replace(**{name: value}) for value in numbers.tolist()]
+    acting = active_excitations(parameters, swept=name)
+    if not acting:
+        periods = [0.0 for _ in plants]
+    elif period is None:
+        periods = [common_period(plant, acting) for plant in plants]
+    else:
+        periods = [checked_period(plant, period, repeats=False) for plant in plants]
+    points = [(value, *pair) for value, pair in zip(numbers.tolist(), zip(plants, periods, strict=True), strict=True)]
+    ways = {"up": ["up"], "down": ["down"], "both": ["up", "down"]}[direction]
+    parts: list[dict[str, Any]] = []
+    state: tuple[float, float] | None = None
+    for way in ways:
+        for value, plant, time in points if way == "up" else points[::-1]:
+            strobe = Stroboscope(plant, time)
+            part, state = _section_at(strobe, state or strobe.checked_start(x, v), transient, cycles, lyapunov)
+            rows = len(part["x"])
+            parts.append({"value": np.full(rows, value), "direction": np.full(rows, way), **part})
+            if progress is not None:
+                progress(len(parts), len(ways) * len(points))
+    columns = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+    section = "stroboscopic" if acting else "maxima of x"
+    return Table(columns, {"parameters": dataclasses.asdict(parameters), "swept": name, "section": section})
+
+
+def _section_at(
+    strobe: Stroboscope, state: tuple[float, float], transient: int, cycles: int, lyapunov: bool
+) -> tuple[dict[str, Any], tuple[float, float] | None]:
+    """Return one value's columns, and the state to continue from, None after a loss of contact."""
+    exponent: LyapunovExponent | None = None
+    try:
+        if strobe.period > 0.0:
+            recorded = strobe.follow(state, transient, cycles, growing=lyapunov)
+            exponent = exponent_of(strobe, recorded) if lyapunov else None
+            xs, vs = recorded.rows[:, kernel.CYCLE_X], recorded.rows[:, kernel.CYCLE_V]
+            stuck = recorded.rows[:, kernel.CYCLE_STICK_TIME] / strobe.period
+        else:
+            xs, vs, stuck = _maxima(strobe, state, transient, cycles), np.zeros(cycles), np.full(cycles, math.nan)
+            exponent = lyapunov_exponent(strobe.parameters, float(xs[-1]), 0.0) if lyapunov else None
+    except OrbitError:
+        cycles = 1
+        xs = vs = stuck = np.full(1, math.nan)
+    part: dict[str, Any] = {"cycle": np.arange(transient, transient + cycles), "x": xs, "v": vs}
+    part["stick_fraction"] = stuck
+    if lyapunov:
+        part["exponent"] = np.full(cycles, exponent.largest if exponent else math.nan)
+        part["standard_error"] = np.full(cycles, exponent.standard_error if exponent else math.nan)
+    return part, (float(xs[-1]), float(vs[-1])) if np.isfinite(xs[-1]) else None
+
+
+def _maxima(strobe: Stroboscope, state: tuple[float, float], transient: int, cycles: int) -> FloatArray:
+    """Return the maxima of x of an unexcited motion that follow ``transient`` of them."""
+    parameters = strobe.parameters
+    places = np.empty(transient + cycles)
+    status, written = kernel.maxima(strobe.plant, *state, parameters.belt_speed, places, traps_of(parameters))
+    if status != kernel.OK:
+        raise lost_motion(parameters, state, status, written)
+    return places[transient:]

@@ -401,7 +401,7 @@ def open_archive(file: BinaryIO, *, sealed: bool = False, compressed: bool = Tru
     signature, *_, directory, _, comment = _END.unpack(end)
     if signature != _END_SIGNATURE or comment != has_seal * _COMMENT_LENGTH:
         raise StoredFileError("not an archive, cut short or damaged: its last record is missing")
-    before = tail[: -_END.size]
+    before = tail[: -_END.size][-_END_64.size :]
     if before[-20:].startswith(_LOCATOR_SIGNATURE):
         if not before.startswith(_END_64_SIGNATURE):
             raise StoredFileError("not an archive that would be written here: its directory is elsewhere")

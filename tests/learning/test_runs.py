@@ -1,5 +1,6 @@
 """Training that is stopped or killed goes on from its last checkpoint as if nothing had happened."""
 
+import dataclasses
 import itertools
 import json
 import os
@@ -595,3 +596,12 @@ def test_the_global_random_states_are_taken_up_where_they_were(tmp_path):
         training.train(tiny_plan(), tmp_path / folder, resume=folder == "run", progress=False)
         ends.append((np.random.random(), torch.rand(1).item()))  # noqa: NPY002  Stable-Baselines3 draws from it
     assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize("folder", sorted(path.name for path in (storage.AGENTS / "pretrained").iterdir()))
+def test_the_weights_of_every_shipped_run_can_be_read_and_act_as_its_network(folder):
+    run = storage.AGENTS / "pretrained" / folder
+    network, policy = dataclasses.replace(runs.load_network(run), frames=1), runs.load_torch_policy(run)
+    observation = np.random.default_rng(0).uniform(-1.0, 1.0, (7, network.observation_size)).astype(np.float32)
+    action, _ = policy.predict(observation, deterministic=True)
+    np.testing.assert_allclose(action, network.predict(observation)[0], atol=1e-5)

@@ -11,6 +11,7 @@ import ast
 import base64
 import dataclasses
 import functools
+import importlib
 import inspect
 import json
 import re
@@ -73,6 +74,11 @@ def public_names() -> dict[str, Described]:
                 if isinstance(part, ast.FunctionDef):
                     name = f"{node.name}.{part.name}"
                     add(name, f"{module}.{name}", ast.get_docstring(part))
+    for path in sd_friction_env._MODULES.values():  # a package's page is that of its first module
+        package = f"sd_friction_env.{path}"
+        if package not in names:
+            first = next(name for name in modules() if name.startswith(f"{package}."))
+            add(package, first, importlib.import_module(package).__doc__)
     for name, path in sd_friction_env._PUBLIC.items():
         if name not in names:  # defined in the kernel, shown where it is imported from
             add(name, f"sd_friction_env.{path}.{name}", inspect.getdoc(getattr(sd_friction_env, name)))

@@ -4,6 +4,7 @@ import importlib.util
 import inspect
 import os
 import re
+import shlex
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -17,6 +18,7 @@ import torch
 import sd_friction_env
 from scripts import cleanrl_ppo
 from sd_friction_env import Task
+from sd_friction_env.cli import main
 from sd_friction_env.control.policies import load_policy
 from sd_friction_env.environments.wrappers import scaled_reward
 from sd_friction_env.learning import evaluation
@@ -59,7 +61,12 @@ COMMANDS = [
 # The pages ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("page", WITH_PYTHON)
+SLOW_PAGES = ("howto/own_law.md", "howto/sb3.md", "tutorial.md")
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=[pytest.mark.slow] if page in SLOW_PAGES else []) for page in WITH_PYTHON]
+)
 def test_the_python_of_a_page_runs_as_printed(page, tmp_path):
     program = f"exec(compile({code_of(page)!r}, {page!r}, 'exec'))"
     run = subprocess.run(
@@ -79,10 +86,22 @@ def test_the_pages_that_teach_have_python_in_them():
     assert {f"howto/{path.name}" for path in (DOCS / "howto").glob("*.md")} <= set(WITH_PYTHON)
 
 
-@pytest.mark.parametrize(("page", "command"), [pair for pair in COMMANDS if pair[1].startswith("sd-friction ")])
+# What takes minutes, serves until it is stopped, or needs a run that another command makes: only its options are read.
+NOT_RUN = re.compile(
+    r"sd-friction (train|tune|tune-classical|optimum|report|explore|evaluate runs/|export runs/|.*runs/)"
+)
+OURS = [pair for pair in COMMANDS if pair[1].startswith("sd-friction ")]
+
+
+@pytest.mark.parametrize(("page", "command"), [pair for pair in OURS if NOT_RUN.match(pair[1])])
+def test_the_long_commands_of_a_page_take_the_options_that_it_shows(page, command):
+    words = shlex.split(command.replace("$SLURM_ARRAY_TASK_ID", "1"))[1:]
+    assert main.parser(words[:1]).parse_args(words).command == words[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "command"), [pair for pair in OURS if not NOT_RUN.match(pair[1])])
 def test_the_commands_of_a_page_run_as_printed(page, command, tmp_path):
-    if command == "sd-friction explore":
-        pytest.skip("it serves until it is stopped: test_explorer.py")
     arguments = [sys.executable, "-m", "sd_friction_env", *command.split()[1:]]
     subprocess.run(arguments, cwd=tmp_path, env=ONE_THREAD, check=True, capture_output=True, timeout=120)
 
@@ -174,6 +193,7 @@ def site(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_site_has_every_page_and_every_module(site):
     expected = {page.replace(".md", ".html") for page in PAGES} | {"tour.html", "api/index.html"}
     expected |= {name.replace(".md", ".html") for name in hooks.BORROWED}
@@ -182,6 +202,7 @@ def test_the_site_has_every_page_and_every_module(site):
     assert not list(site.rglob("*.py"))
 
 
+@pytest.mark.slow
 def test_the_site_loads_nothing_from_elsewhere_and_has_no_dead_link(site):
     for page in site.rglob("*.html"):
         if page.name == "404.html":  # knows only its place on a server
@@ -195,6 +216,7 @@ def test_the_site_loads_nothing_from_elsewhere_and_has_no_dead_link(site):
                 assert (page.parent / path).exists(), f"{page.name}: {place}"
 
 
+@pytest.mark.slow
 def test_the_api_has_an_entry_with_its_own_type_for_each_name_that_a_docstring_describes(site):
     pages = sorted((site / "api").glob("sd_friction_env.physics.orbits*.html"))
     page = "".join(path.read_text(encoding="utf-8") for path in pages)
@@ -207,18 +229,21 @@ def test_the_api_has_an_entry_with_its_own_type_for_each_name_that_a_docstring_d
         assert re.search(rf">{name}</span></code></b>\s*\(<code><span title=\"{kind}\">", page), name
 
 
+@pytest.mark.slow
 def test_the_overview_of_the_api_names_all_that_the_package_offers_at_its_top_level(site):
     page = (site / "api" / "index.html").read_text(encoding="utf-8")
     offered = set(sd_friction_env.__all__) - {"__version__", "ENVIRONMENT_IDS"}
     assert {name for name in offered if f"<code>{name}</code></a>" not in page} == set()
 
 
+@pytest.mark.slow
 def test_formulas_are_typeset_without_a_server(site):
     page = (site / "environment.html").read_text(encoding="utf-8")
     assert page.count('<div class="arithmatex">') >= 4
     assert 'src="katex/katex.min.js"' in page
 
 
+@pytest.mark.slow
 def test_the_api_shows_docstrings_with_links(site):
     page = (site / "api" / "sd_friction_env.physics.curves.html").read_text(encoding="utf-8")
     assert "Return all attractors at each belt speed" in page
@@ -229,6 +254,7 @@ def test_the_api_shows_docstrings_with_links(site):
         assert "<autoref" not in text, path.name
 
 
+@pytest.mark.slow
 def test_the_environment_page_is_the_docstring_in_gymnasiums_form(site):
     page = (site / "environment.html").read_text(encoding="utf-8")
     headings = [re.sub(r"<.*?>|&para;", "", heading) for heading in re.findall(r"<h2.*?>(.*?)</h2>", page, re.S)]
@@ -251,6 +277,7 @@ def test_the_environment_page_is_the_docstring_in_gymnasiums_form(site):
 # The notebook ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_notebook_runs_and_shows_what_is_kept(monkeypatch):
     monkeypatch.setenv("TOUR_TRAINING_STEPS", "4096")
     monkeypatch.setenv("OMP_NUM_THREADS", "1")

@@ -68,7 +68,7 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line."""
 
     def __init__(self, **arguments: Any) -> None:
-        super().__init__(allow_abbrev=False, **arguments)
+        super().__init__(**{"allow_abbrev": False, **arguments})
         # What argparse takes for a value and not for an option: ranges that begin below zero, too.
         self._negative_number_matcher = re.compile(r"^-[\d.]")
 

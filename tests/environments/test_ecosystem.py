@@ -318,6 +318,7 @@ def test_statistics_of_a_batch_are_recorded():
 
 # Minari leaves its temporary folders to the garbage collector.
 @pytest.mark.filterwarnings("ignore:Implicitly cleaning up:ResourceWarning")
+@pytest.mark.slow
 def test_a_minari_data_set_holds_the_episodes_and_makes_the_environment_again(tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))

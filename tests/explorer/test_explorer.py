@@ -743,6 +743,7 @@ def data(page, source):
     )
 
 
+@pytest.mark.slow
 def test_in_a_browser_a_slider_moves_the_curve(page):
     before = data(page, "curve")["amplitude"]
     handle = page.locator(".noUi-handle").nth(2)  # the hand, the belt's speed, alpha
@@ -761,6 +762,7 @@ def test_in_a_browser_a_slider_moves_the_curve(page):
     page.wait_for_function("Bokeh.documents[0].get_model_by_name('alpha').value === 0.8")
 
 
+@pytest.mark.slow
 def test_in_a_browser_the_agent_suppresses_and_a_picture_is_made(page, tmp_path):
     page.get_by_text("squeal again").click()
     page.wait_for_function("Bokeh.documents[0].get_model_by_name('point').data.amplitude[0] > 0.35", timeout=60_000)
@@ -775,6 +777,7 @@ def test_in_a_browser_the_agent_suppresses_and_a_picture_is_made(page, tmp_path)
 
 
 @pytest.mark.parametrize("width", [800, 1330, 1920])
+@pytest.mark.slow
 def test_in_a_browser_all_controls_fit_on_the_screen(page, width):
     page.set_viewport_size({"width": width, "height": 900})
     for tab in ("friction", "excitation", "oscillator"):
@@ -787,6 +790,7 @@ def test_in_a_browser_all_controls_fit_on_the_screen(page, width):
     assert scrolled == [width, 900]
 
 
+@pytest.mark.slow
 def test_in_a_browser_one_takes_over_by_hand(page):
     page.get_by_text("+1 ▶").click()
     page.wait_for_function("Bokeh.documents[0].get_model_by_name('controller').value === 'by hand'")

@@ -240,6 +240,7 @@ def killer(base, mode):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that can be forked and killed")
+@pytest.mark.slow
 def test_a_run_killed_again_and_again_ends_as_one_that_was_not(tmp_path):
     training.train(tiny_plan(timesteps=384), tmp_path / "whole", progress=False)
     assert killer(tmp_path, "chain") >= 4

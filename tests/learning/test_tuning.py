@@ -305,6 +305,7 @@ def test_another_search_space_and_another_programs_study_are_refused(storage):
     assert not foreign.user_attrs
 
 
+@pytest.mark.slow
 def test_two_workers_share_a_study_and_one_may_be_killed(storage):
     search = tiny_search(timesteps=16384, evaluations=8, pruner="none")
     opened = tuning.open_study(search, storage, "study")
@@ -340,6 +341,7 @@ def command(storage, *more):
     return ["--task", "force", "--algo", "ppo", "--storage", storage, "--study", "study", *size, *fixed, *more]
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_study_that_the_same_command_continues_and_training_takes_its_best(storage, tmp_path, capsys):
     out = tmp_path / "best.yml"
     endless = [sys.executable, "-W", "error", "-m", "sd_friction_env", "tune", *command(storage, "--trials", "100000")]

@@ -104,6 +104,7 @@ def test_a_users_law_gives_the_bits_of_the_same_law_built_in():
     assert episode(own, 4) == episode(built_in, 4)
 
 
+@pytest.mark.slow
 def test_a_users_spring_gives_the_bits_of_the_same_spring_built_in():
     own, built_in = OscillatorParameters(geometry=OwnLinear(1.0)), OscillatorParameters(geometry="linear")
     states = [
@@ -419,6 +420,7 @@ class OwnCoulomb(NamedTuple):
         return 0.0
 
 
+@pytest.mark.slow
 def test_numbers_of_one_users_law_are_not_taken_for_those_of_another():
     laws = [OwnCoulomb(0.4, 0.3), OwnStribeck(0.3, 0.2, 0.1), OWN.friction, "coulomb", OwnCoulomb(0.2, 0.1)]
     per_env = [{"parameters": {"friction": law}} for law in laws]

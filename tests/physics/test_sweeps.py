@@ -105,6 +105,7 @@ def test_basins_from_processes_are_the_same_bits(workers, expected):
     assert same_basins(basin_sweep(TWO_WELLS, *GRID, Engine(backend="loky", workers=workers), chunk=500), expected)
 
 
+@pytest.mark.slow
 def test_basins_from_ray_are_the_same_bits(expected):
     pytest.importorskip("ray")
     program = (

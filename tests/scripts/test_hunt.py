@@ -298,6 +298,7 @@ def mixed_trial(seed, index):
     return {"largest": float(index)}
 
 
+@pytest.mark.slow
 def test_a_hunt_outlives_trials_that_hang_or_crash():
     check = Check("mixed", "all kinds", mixed_trial, patience=3.0)
     findings = trials.hunt(check, 0, 0, 9, None, 5)

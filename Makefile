@@ -15,6 +15,7 @@ else
 RUN := $(VENV)/bin/python
 PEERS_RUN := .venv-peers/bin/python
 endif
+QUICK := tests/kernel/test_kernel.py tests/physics/test_orbits.py tests/physics/test_theory.py tests/environments/test_single.py
 DEMO_STAMP := $(VENV)/.demo
 STAMP := $(VENV)/.installed
 # pip's output; make setup QUIET= shows it.
@@ -26,7 +27,7 @@ PIP := -m pip --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint format slow reference benchmark benchmark-peers figures report docs constraints clean hunt
+.PHONY: help setup demo quick test test-all lint format slow reference benchmark benchmark-peers figures report docs constraints clean hunt
 
 help: ## list the targets
 	@echo "Usage: make TARGET [ARGS=...] [PYTHON=python3.12] [TORCH_INDEX=https://download.pytorch.org/whl/cpu]"
@@ -69,7 +70,14 @@ $(STAMP): $(DEMO_STAMP)
 demo: $(DEMO_STAMP) ## draw the amplitude curve, train both agents, compare them with passive and classical (minutes)
 	"$(RUN)" scripts/demo.py $(ARGS)
 
-test: setup ## run every check and test
+quick: setup ## while working: ruff, and tests of one environment, the kernel and the orbits (under a minute)
+	"$(RUN)" -m ruff check .
+	"$(RUN)" -m pytest -x -n 2 $(QUICK) $(ARGS)
+
+test-all: setup ## run every check and every test, the slow ones too
+	"$(RUN)" scripts/check.py -m "" $(ARGS)
+
+test: setup ## run every check, and the tests but for those that take minutes
 	"$(RUN)" scripts/check.py $(ARGS)
 
 lint: setup ## run every check but the tests
@@ -80,7 +88,7 @@ format: setup ## let ruff mend and format the code
 	"$(RUN)" -m ruff format .
 
 slow: setup ## run the tests that take minutes
-	"$(RUN)" -m pytest -m slow $(ARGS)
+	"$(RUN)" -m pytest -m slow -n 2 $(ARGS)
 
 reference: setup ## print each accuracy target next to the measured value
 	"$(RUN)" scripts/verify.py $(ARGS)

@@ -325,7 +325,7 @@ def _count_values(node: Any, counts: dict[int, int]) -> int:
     """
     if id(node) in counts:
         if not counts[id(node)]:
-            raise StoredFileError("an alias of what it lies in")
+            raise StoredFileError("a YAML alias refers to a value that contains it")
         return counts[id(node)]
     counts[id(node)] = 0
     children = node.value if isinstance(node.value, list) else []

@@ -160,7 +160,7 @@ def bomb(level, first):
     ("text", "said"),
     [
         ("a: {b: 1, b: 2}", "'b' is given twice"),
-        ("a: &x [*x]", "alias of what it lies in"),
+        ("a: &x [*x]", "alias refers to a value that contains it"),
         (bomb("[{}]", "[0]"), "more than 20,000 values"),
         (bomb("{{<<: [{}]}}", "{a: 1}"), "more than 20,000 values"),
         ("[" * 200 + "]" * 200, "200 brackets"),

@@ -23,8 +23,8 @@ from sd_friction_env.extras import extra
 from sd_friction_env.learning import evaluation
 
 TEXT = """\
-Scaling and clipping of the measurements and the command that an action stands for are in the graph; its metadata say
-what the measurements are and how often it is to be asked. All is dimensionless. Nothing is written unless the actions
+The graph scales and clips the measurements and converts the action to a command; its metadata list the measurements and
+the sampling time. All is dimensionless. Nothing is written unless the actions
 on the trial measurements agree with the agent's to 1e-6, and the map from measurements to observations and commands
 with the environment's own."""
 

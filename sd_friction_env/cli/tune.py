@@ -55,7 +55,9 @@ def _add_tune(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--timesteps", type=int, metavar="N", help="of each trial (default: the file's n_timesteps)")
     how.add_argument("--workers", type=int, default=1, metavar="N", help="processes, one thread each (default: 1)")
     how.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
-    how.add_argument("--pruner", default="median", help="of hopeless trials: median, hyperband, none (default: median)")
+    how.add_argument(
+        "--pruner", default="median", help="stops unpromising trials early: median, hyperband, none (default: median)"
+    )
     how.add_argument("--evaluations", type=int, default=20, metavar="N", help="of each trial (default: 20)")
     how.add_argument("--eval-episodes", type=int, default=100, metavar="N", help="of each evaluation (default: 100)")
     out = parser.add_argument_group("what is written")

@@ -14,6 +14,7 @@ from sd_friction_env import kernel
 from sd_friction_env.physics.orbits import LimitCycle, OrbitError, equilibria, limit_cycle, rest_place
 from sd_friction_env.physics.parameters import (
     EXCITATIONS,
+    FIELDS,
     RANGES,
     SMALLEST_ALPHA,
     STATE_LIMIT,
@@ -149,8 +150,9 @@ class Task:
         unknown = sorted(set(arguments) - set(cls.field_names()))
         if unknown:
             # Gymnasium looks for Python's own wording when it tries optional arguments.
-            allowed = ", ".join(cls.field_names())
-            raise TypeError(f"__init__() got an unexpected keyword argument {unknown[0]!r}; allowed: {allowed}")
+            allowed = ", ".join(("parameters", "reward", "render_mode", "render_size", *cls.field_names()))
+            hint = f"; pass parameters={{{unknown[0]!r}: ...}}" if unknown[0] in FIELDS else ""
+            raise TypeError(f"__init__() got an unexpected keyword argument {unknown[0]!r}{hint}; allowed: {allowed}")
         return cls(**arguments)
 
     @property

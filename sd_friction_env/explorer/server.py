@@ -1,9 +1,9 @@
-"""The explorer's server: Bokeh's, for requests to the names it was started for alone, and for so many pages at a time.
+"""The explorer's server: Bokeh's own. It answers requests for its host names only, and limits the number of pages.
 
 It streams to the page over one socket and loads nothing from elsewhere.
 
-A page of another site can make a name of its own lead to this machine (DNS rebinding) and would then be of one origin
-with the explorer; its requests carry that name in Host. So every request is checked, before anything else sees it.
+Another site can point its own host name at this machine (DNS rebinding) and would then share the explorer's origin. Its
+requests carry that name in Host, so every request is checked before anything else sees it.
 """
 
 import contextlib

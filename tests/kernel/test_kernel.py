@@ -109,7 +109,7 @@ def test_no_corner_of_what_is_accepted_defeats_the_error_rule():
         geometry = GEOMETRIES[rng.integers(4)]
         if values["alpha"] < SMALLEST_ALPHA:
             values["alpha"] = 0.0 if geometry != "cubic" else SMALLEST_ALPHA
-        laws = {"geometry": geometry, "friction": FRICTIONS[rng.integers(4)]}
+        laws = {"geometry": geometry, "friction": FRICTIONS[rng.integers(len(FRICTIONS))]}
         p = OscillatorParameters(**laws, **values)
         if rng.integers(2):
             p = p.unexcited.replace(friction="stribeck")

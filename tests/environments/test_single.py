@@ -470,7 +470,7 @@ def test_a_bad_option_is_refused_and_the_episode_goes_on(options, message):
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"gain": 1}, TypeError, r"__init__\(\) got an unexpected keyword argument 'gain'; allowed: actuator"),
+        ({"gain": 1}, TypeError, r"__init__\(\) got an unexpected keyword argument 'gain'; allowed: parameters"),
         ({"actuator": "magnet"}, ValueError, "actuator must be one of"),
         ({"control_interval": 0.0}, ValueError, "control_interval must be"),
         ({"control_interval": math.nan}, ValueError, "control_interval must be"),

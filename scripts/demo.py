@@ -20,12 +20,13 @@ import numpy as np
 from scripts.figures import common, paper
 from sd_friction_env import OscillatorParameters, SDFrictionEnv, Table, limit_cycle, simulate
 from sd_friction_env.control.policies import Policy, ZeroPolicy
+from sd_friction_env.environments.ids import environment_id
 from sd_friction_env.learning import classical, evaluation, training
 from sd_friction_env.learning.plan import make_plan
 from sd_friction_env.physics.simulation import Trajectory, amplitude
 from sd_friction_env.pictures import plotting
 
-TASKS = {"force": "SDFriction/Force-v0", "belt": "SDFriction/BeltSpeed-v0"}
+TASKS = {task: environment_id(task) for task in ("force", "belt")}
 SWEPT_BELT_SPEEDS = np.arange(0.05, 0.451, 0.025)
 SWITCH_ON = 300  # control intervals of passive motion in the histories
 

@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from sd_friction_env.cli.options import TASKS, TIERS, Parser, environment_id
+from sd_friction_env.cli.options import Parser
 from sd_friction_env.control.pretrained import fingerprint, pretrained_file
+from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
 from sd_friction_env.learning import evaluation, runs
 from sd_friction_env.learning.settings import ALGORITHMS
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register
 
+from sd_friction_env.environments.ids import ARGUMENTS, ENVIRONMENT_IDS
+
 if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out for type checkers
     from sd_friction_env.control import policies
     from sd_friction_env.control.policies import load_policy
@@ -146,22 +148,13 @@ __all__ = [
     "theory",
 ]
 
-# Hidden parameters of the randomised tier, and the sensor of the sensed tier.
-_RANDOMISED: dict[str, Any] = {"randomise": {"belt_speed": (0.1, 0.35), "alpha": (0.6, 0.95), "mu_m": (0.03, 0.12)}}
-_SENSED: dict[str, Any] = {"sensor": "position", "sensor_noise": 0.005, "sensor_delay": 1}
-_TIERS = {"": {}, "Randomised": _RANDOMISED, "Sensed": _SENSED}
-_ACTUATORS = {"Force": "force", "BeltSpeed": "belt_speed"}
-
-ENVIRONMENT_IDS = tuple(f"SDFriction/{name}{tier}-v0" for name in _ACTUATORS for tier in _TIERS)
-
-for _name, _actuator in _ACTUATORS.items():
-    for _tier, _arguments in _TIERS.items():
-        register(
-            id=f"SDFriction/{_name}{_tier}-v0",
-            entry_point="sd_friction_env.environments.single:SDFrictionEnv",
-            vector_entry_point="sd_friction_env.environments.batch:SDFrictionVectorEnv",
-            kwargs={"actuator": _actuator, **_arguments},
-        )
+for _id, _arguments in ARGUMENTS.items():
+    register(
+        id=_id,
+        entry_point="sd_friction_env.environments.single:SDFrictionEnv",
+        vector_entry_point="sd_friction_env.environments.batch:SDFrictionVectorEnv",
+        kwargs=_arguments,
+    )
 
 
 def __getattr__(name: str) -> Any:

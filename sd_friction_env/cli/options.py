@@ -19,6 +19,7 @@ import numpy as np
 
 import sd_friction_env
 from sd_friction_env import ENVIRONMENT_IDS, Table
+from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
 from sd_friction_env.physics import sweeps
 from sd_friction_env.physics.laws import friction_table
 from sd_friction_env.physics.parameters import FIELDS, FRICTIONS, GEOMETRIES, RANGES, OscillatorParameters
@@ -27,8 +28,6 @@ from sd_friction_env.pictures import plotting
 from sd_friction_env.storage import StoredFileError, atomic_file, checked_ending, parse_yaml
 
 FAILURE, BAD_USAGE, INTERRUPTED = 1, 2, 130
-TASKS = {"force": "Force", "belt": "BeltSpeed"}
-TIERS = {"nominal": "", "randomised": "Randomised", "sensed": "Sensed"}
 
 _SCALES = ("time_scale", "length_scale", "force_scale")
 _LAWS_OF_THE_PAPER = ("", "exact, cubic", "stribeck")
@@ -78,11 +77,6 @@ class Parser(argparse.ArgumentParser):
 
 
 # Environments and agents ----------------------------------------------------------------------------------------------
-
-
-def environment_id(task: str, tier: str) -> str:
-    """Return the registered id of a task and tier."""
-    return f"SDFriction/{TASKS[task]}{TIERS[tier]}-v0"
 
 
 def add_environment(parser: argparse._ActionsContainer, *, arguments: bool = True) -> None:

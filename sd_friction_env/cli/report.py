@@ -10,14 +10,13 @@ import scipy
 
 import sd_friction_env
 from sd_friction_env.cli.options import (
-    TASKS,
-    TIERS,
     Command,
     FailedError,
     UsageError,
     check_at_least,
     command_line,
 )
+from sd_friction_env.environments.ids import TASKS, TIERS
 from sd_friction_env.extras import extra
 from sd_friction_env.storage import AGENTS
 

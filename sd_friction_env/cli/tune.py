@@ -4,8 +4,6 @@ import argparse
 from pathlib import Path
 
 from sd_friction_env.cli.options import (
-    TASKS,
-    TIERS,
     Command,
     FailedError,
     UsageError,
@@ -13,10 +11,10 @@ from sd_friction_env.cli.options import (
     assignments,
     check_at_least,
     command_line,
-    environment_id,
     environment_of,
     stop_requests,
 )
+from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
 from sd_friction_env.extras import extra
 from sd_friction_env.learning import classical
 from sd_friction_env.learning.settings import ALGORITHMS

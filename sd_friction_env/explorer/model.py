@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env.control.policies import ConstantPolicy, Policy, State, VelocityFeedback, ZeroPolicy
 from sd_friction_env.control.pretrained import load_pretrained
+from sd_friction_env.environments.ids import environment_id
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.physics.basins import basin_grid
 from sd_friction_env.physics.curves import amplitude_curve
@@ -29,7 +30,6 @@ from sd_friction_env.physics.orbits import LimitCycle, OrbitError, limit_cycle
 from sd_friction_env.physics.parameters import STATE_LIMIT, Kind, OscillatorParameters
 from sd_friction_env.pictures.plotting import BLACK, BLUE, GREEN, GREY, VERMILION
 
-TASKS = {"force": "Force", "belt": "BeltSpeed"}
 OFF, FEEDBACK, AGENT, ROBUST, HAND = "off", "velocity feedback", "trained agent", "trained agent, robust", "by hand"
 PLUGINS = "sd_friction_env.controllers"  # group of entry points: functions from an environment's id to a policy
 BASIN_VIEW = ((-1.6, 1.6), (-1.2, 1.2))  # starts in x and in v
@@ -127,7 +127,7 @@ class Live:
     def choose_task(self, task: str) -> None:
         """Take another actuator and start again."""
         self.task = task
-        self.env_id = f"SDFriction/{TASKS[task]}-v0"
+        self.env_id = environment_id(task)
         self.loop, self.uncontrolled, self.reference = (self._loop(policy) for policy in (OFF, OFF, AGENT))
         self.choose_controller(self.controller)
         self.restart()

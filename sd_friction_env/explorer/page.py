@@ -28,13 +28,13 @@ from bokeh.palettes import Cividis
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
+from sd_friction_env.environments.ids import TASKS
 from sd_friction_env.explorer.model import (
     AT_REST,
     BASIN_VIEW,
     COMPILATION,
     HAND,
     OFF,
-    TASKS,
     Latest,
     Live,
     PlantPicture,

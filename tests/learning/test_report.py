@@ -13,8 +13,8 @@ import pytest
 
 from sd_friction_env import OscillatorParameters, Table, limit_cycle
 from sd_friction_env.cli.main import main
-from sd_friction_env.cli.options import TASKS, TIERS, environment_id
 from sd_friction_env.control.policies import ConstantPolicy, NetworkPolicy, VelocityFeedback, ZeroPolicy
+from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
 from sd_friction_env.learning import classical, evaluation, optimal, report, runs
 from sd_friction_env.learning.report import ENV_IDS, QUICK, Effort, Replay, Report
 from sd_friction_env.learning.report.agents import LEARNING

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sd_friction_env import kernel
+from sd_friction_env.environments import ids
+from sd_friction_env.environments.ids import environment_id
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.environments.task import ACTUATOR_CODES, Task
 from sd_friction_env.physics.parameters import OscillatorParameters
 
 Array = NDArray[np.float64]
 Progress = Callable[[range, str], Iterable[int]]
-TASKS = {"force": "SDFriction/Force-v0", "belt": "SDFriction/BeltSpeed-v0"}
-RANDOMISED = {"force": "SDFriction/ForceRandomised-v0", "belt": "SDFriction/BeltSpeedRandomised-v0"}
-SENSED = {"force": "SDFriction/ForceSensed-v0", "belt": "SDFriction/BeltSpeedSensed-v0"}
+TASKS, RANDOMISED, SENSED = ({task: environment_id(task, tier) for task in ids.TASKS} for tier in ids.TIERS)
 
 
 def silent(steps: range, label: str) -> Iterable[int]:

@@ -4,7 +4,8 @@ Everything is computed into tables first (:class:`Report`), then drawn, then wri
 its pictures in it. Needs matplotlib and Jinja2 (extra "report").
 """
 
-from sd_friction_env.learning.report.agents import ENV_IDS, TASKS, TIERS, Agent, Key, Row, find_agents
+from sd_friction_env.environments.ids import TASKS, TIERS
+from sd_friction_env.learning.report.agents import ENV_IDS, Agent, Key, Row, find_agents
 from sd_friction_env.learning.report.comparison import (
     FULL,
     QUICK,

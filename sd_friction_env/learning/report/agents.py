@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sd_friction_env import ENVIRONMENT_IDS, Table
+from sd_friction_env import Table
 from sd_friction_env.control.policies import Policy
+from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
 from sd_friction_env.learning import runs
 from sd_friction_env.learning.settings import ALGORITHMS, one_line
 
-TASKS = ("force", "belt")
-TIERS = ("nominal", "randomised", "sensed")
 Key = tuple[str, str]  # task, tier
-ENV_IDS: dict[Key, str] = dict(zip(itertools.product(TASKS, TIERS), ENVIRONMENT_IDS, strict=True))
+ENV_IDS: dict[Key, str] = {key: environment_id(*key) for key in itertools.product(TASKS, TIERS)}
 Row = dict[str, Any]
 _FOLDER = re.compile(rf"({'|'.join(TASKS)})-({'|'.join(TIERS)})-({'|'.join(ALGORITHMS)})-(\d+)")
 LEARNING = ("steps", "seconds", "mean_return", "suppressed")  # columns read from evaluations.csv

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from sd_friction_env import Table
 from sd_friction_env.control.policies import Actions, ConstantPolicy, Policy, State, ZeroPolicy
+from sd_friction_env.environments.ids import TASKS
 from sd_friction_env.learning import classical, evaluation, scores
 from sd_friction_env.learning import optimal as stored
-from sd_friction_env.learning.report.agents import ENV_IDS, TASKS, Agent, Key, Row, by_algorithm
+from sd_friction_env.learning.report.agents import ENV_IDS, Agent, Key, Row, by_algorithm
 
 _OPTIMUM_KNOWS = {"nominal": "", "randomised": " (knows the parameters)", "sensed": " (sees all)"}
 

@@ -21,7 +21,8 @@ from sd_friction_env.storage import atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-from sd_friction_env.learning.report.agents import ENV_IDS, TIERS, Agent, Key, Row
+from sd_friction_env.environments.ids import TIERS
+from sd_friction_env.learning.report.agents import ENV_IDS, Agent, Key, Row
 from sd_friction_env.learning.report.comparison import FULL, Comparison, Effort, compare, over_tasks
 from sd_friction_env.learning.report.curves import (
     REACHED,

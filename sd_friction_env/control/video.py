@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env.control.policies.policy import Policy, State, ZeroPolicy
 from sd_friction_env.environments.single import SDFrictionEnv
+from sd_friction_env.extras import extra
 from sd_friction_env.storage import checked_ending
 
 FORMATS = (".gif", ".mp4")
@@ -92,13 +93,11 @@ def check_video_path(path: str | os.PathLike[str], fps: int = 30) -> Path:
     fastest, kind = (50, " for a GIF") if ending == ".gif" else (60, "")
     if not 1 <= fps <= fastest:
         raise ValueError(f"fps must be in [1, {fastest}]{kind}, got {fps!r}")
-    try:
+    with extra("video"):
         import imageio  # noqa: F401
 
         if ending == ".mp4":
             import imageio_ffmpeg  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f'videos need {error.name}: pip install "sd-friction-env[video]"') from None
     return target
 
 

@@ -4,6 +4,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from sd_friction_env.extras import extra
 from sd_friction_env.physics.laws import friction_table
 from sd_friction_env.physics.parameters import OscillatorParameters
 
@@ -44,10 +45,8 @@ def _entries(path: Path) -> dict[str, Any]:
         if ending == ".toml":
             entries: Any = tomllib.loads(content.decode())
         else:
-            try:
+            with extra("train"):
                 import yaml
-            except ImportError as error:
-                raise ImportError('rig files in YAML need PyYAML: pip install "sd-friction-env[train]"') from error
             entries = yaml.safe_load(content)
     except (ValueError, UnicodeDecodeError) as fault:
         raise ValueError(f"{str(path)!r} is no {ending[1:].upper()} file: {fault}") from None

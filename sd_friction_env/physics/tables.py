@@ -10,6 +10,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sd_friction_env.extras import extra
 from sd_friction_env.storage import LARGEST_ARCHIVE, atomic_file, read_text
 
 _SHOWN_ROWS = 10
@@ -56,10 +57,8 @@ class Table(dict[str, NDArray[Any]]):
         Raises:
             ImportError: if pandas is not installed.
         """
-        try:
+        with extra("plot"):
             import pandas as pd
-        except ImportError as error:
-            raise ImportError('a DataFrame needs pandas: pip install "sd-friction-env[plot]"') from error
         return pd.DataFrame(dict(self))
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sd_friction_env.extras import extra
 from sd_friction_env.physics.basins import Basins
 from sd_friction_env.physics.forced import ForcedBasins
 from sd_friction_env.physics.orbits import LimitCycle
@@ -75,10 +76,8 @@ def house_style() -> Iterator[None]:
     Raises:
         ImportError: if matplotlib is not installed.
     """
-    try:
+    with extra("plot"):
         import matplotlib
-    except ImportError as error:
-        raise ImportError('figures need matplotlib: pip install "sd-friction-env[plot]"') from error
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams["svg.hashsalt"] = "sd_friction_env"  # the names in an .svg do not change from run to run

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sd_friction_env.extras import extra
 from sd_friction_env.physics.parameters import brief_repr
 from sd_friction_env.pictures.canvas import GROUND, Canvas, Frame, Lettering
 from sd_friction_env.pictures.gauges import draw_captions, draw_readouts
@@ -196,10 +197,8 @@ def _draw_backdrop(frame: Frame) -> None:
 
 def _require_pygame() -> None:
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # or pygame greets on standard output
-    try:
+    with extra("render"):
         import pygame.font
-    except ImportError as error:
-        raise ImportError('rendering needs pygame-ce: pip install "sd-friction-env[render]"') from error
     pygame.font.init()  # needs no display; does nothing the second time
 
 

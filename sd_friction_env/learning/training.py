@@ -217,6 +217,8 @@ class _Supervisor(BaseCallback):
 
     def _on_step(self) -> bool:
         log_episodes(self.locals["infos"], self.locals["dones"], self.logger)
+        if self.bar.n == self.bar.initial:
+            self.bar.unpause()  # the time left does not count what the first step compiled
         self.bar.update(min(self.num_timesteps, self.plan.steps) - self.bar.n)
         self.stopped = self.stopped or self.should_stop()
         return True

@@ -16,6 +16,7 @@ from sd_friction_env.control.policies import ConstantPolicy, NetworkPolicy, Velo
 from sd_friction_env.learning import classical, evaluation, optimal, scores
 from sd_friction_env.learning.evaluation import Episodes, evaluate, metrics, run_episodes, summarise
 from sd_friction_env.learning.scores import score
+from sd_friction_env.storage import AGENTS
 
 STEPS = 40
 FORCE, BELT = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0"
@@ -364,6 +365,10 @@ def test_the_script_refuses_bad_arguments_in_one_line(tmp_path, capsys):
         (["--task", "force", "--csv", str(tmp_path / "no" / "x.csv")], "--csv must be"),
         (["--task", "force", "--env-arg", "w_effort=-1"], "w_effort"),
         (["--task", "force", "--tier", "sensed", "--controller", "velocity-feedback"], "sees the position only"),
+        (
+            [str(AGENTS / "best" / "SDFriction-ForceSensed-v0.npz"), "--task", "belt", "--tier", "sensed"],
+            "whose actuator",
+        ),
     ):
         assert main(["evaluate", *command]) == 2
         error = capsys.readouterr().err

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sd_friction_env import OscillatorParameters, Table, amplitude_curve, critical_belt_speeds, limit_cycle
+from sd_friction_env.physics.curves import refined_curve
 
 CUBIC = OscillatorParameters(geometry="cubic")
 
@@ -75,3 +76,20 @@ def test_a_table_is_written_whole_or_not_at_all(tmp_path):
         Table({"a": [1.0], "b": [1.0, 2.0]})
     with pytest.raises(FileNotFoundError):
         Table({"a": [1.0]}).to_csv(tmp_path / "nowhere" / "t.csv")
+
+
+def test_a_refined_curve_meets_at_the_critical_speeds_from_both_sides_and_has_the_points_asked_for():
+    speeds = np.arange(0.3, 0.55, 0.05)
+    curve = refined_curve(OscillatorParameters(), speeds)
+    v_b0, v_b1 = critical_belt_speeds(OscillatorParameters())
+    at, kind, size = (np.asarray(curve[name]) for name in ("belt_speed", "kind", "amplitude"))
+    assert set(speeds) <= set(at)
+    assert np.all(np.diff(at) > 0.0)
+    for critical, kinds in ((v_b0, ("stick-slip", "pure-slip")), (v_b1, ("pure-slip", "steady-slip"))):
+        below, above = np.flatnonzero(at < critical)[-1], np.flatnonzero(at > critical)[0]
+        assert at[above] - at[below] < 1e-8
+        assert (kind[below], kind[above]) == kinds
+        assert abs(size[above] - size[below]) < 1e-3
+    assert np.count_nonzero(kind == "pure-slip") >= 25
+    plain = amplitude_curve(OscillatorParameters(), speeds)
+    assert size[np.isin(at, speeds)].tolist() == np.asarray(plain["amplitude"]).tolist()

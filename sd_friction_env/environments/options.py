@@ -80,7 +80,7 @@ def checked_options(options: Any) -> dict[str, Any]:
         if name in checked:
             checked[name] = checked_number(f"options[{name!r}]", checked[name], -STATE_LIMIT, STATE_LIMIT)
     if "v" in checked and "x" not in checked:
-        raise ValueError(f"options['v'] = {checked['v']!r} needs options['x'] beside it")
+        raise ValueError(f"options['v'] = {checked['v']!r} is allowed only together with options['x']")
     if "phase" in checked:
         checked["phase"] = checked_number("options['phase']", checked["phase"], 0.0, 1.0)
     if sum(name in checked for name in ("x", "phase", "start")) > 1:

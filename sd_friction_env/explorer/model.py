@@ -335,9 +335,9 @@ def _load_steps(kind: Kind) -> None:
 
 
 class Latest:
-    """Work in the background of which only the newest request counts.
+    """Background work of which at most one piece runs and one waits.
 
-    At most one piece of work runs and at most one waits; a newer request replaces the one that waits. Results are
+    A newer request replaces the one that waits. Results are
     shown by :meth:`poll` alone, so that only the server's own thread touches a page.
 
     Args:

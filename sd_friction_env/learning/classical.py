@@ -399,7 +399,7 @@ def stored_gains(path: Path | None = None) -> dict[str, dict[str, Any]]:
         for env_id, controllers in gains.items():
             for name, found in controllers.items():
                 if env_id not in ENVIRONMENT_IDS or name not in KINDS:
-                    raise ValueError(f"{env_id}: {name}")
+                    raise ValueError(f"unknown environment or controller: {env_id}: {name}")
                 if set(found["values"]) != set(KINDS[name].ranges(_nominal_env(env_id))):
                     raise ValueError(f"{env_id}: {name}: {sorted(found['values'])}")
                 _with(name, env_id, found["values"])

@@ -200,7 +200,10 @@ def metrics(episodes: Episodes, passive: Episodes) -> Table:
         ValueError: if the passive episodes are not of the same seeds and length.
     """
     if not np.array_equal(episodes.seeds, passive.seeds) or episodes.reward.shape != passive.reward.shape:
-        raise ValueError("passive must hold the same episodes: same seeds, same length")
+        raise ValueError(
+            f"passive must hold episodes of the same seeds and length, got shape {passive.reward.shape} for "
+            f"{episodes.reward.shape} and seeds from {passive.seeds[0]} for {episodes.seeds[0]}"
+        )
     steps = episodes.reward.shape[1]
     quarter = steps - max(1, steps // 4)
     half, late = _part(episodes, passive, steps - max(1, steps // 2), ""), _part(episodes, passive, quarter, "late_")

@@ -71,7 +71,7 @@ class Box:
         return (self.left + self.right) / 2, (self.top + self.bottom) / 2
 
     def grown(self, by: float) -> "Box":
-        """Return the box with every side moved out by so much."""
+        """Return the box with every side moved out by this distance."""
         return Box(self.left - by, self.top - by, self.right + by, self.bottom + by)
 
     @staticmethod

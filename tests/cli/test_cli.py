@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +21,7 @@ from sd_friction_env import (
 )
 from sd_friction_env.cli import doctor
 from sd_friction_env.cli.main import main
-from sd_friction_env.cli.options import numbers
+from sd_friction_env.cli.options import numbers, stop_requests
 from sd_friction_env.control import pretrained
 from sd_friction_env.control.pretrained import pretrained_file
 from sd_friction_env.physics.curves import refined_curve
@@ -344,3 +345,14 @@ def test_a_refined_curve_has_the_critical_speeds_from_both_sides():
         assert curve["kind"][near].tolist() == kinds
     assert curve["amplitude"][[0, -1]].tolist() == plain["amplitude"].tolist()
     assert refined_curve(OscillatorParameters(), [0.1, 0.2]).n_rows == 2
+
+
+def test_the_first_ctrl_c_asks_to_stop_and_the_second_interrupts():
+    before = signal.getsignal(signal.SIGINT)
+    with stop_requests() as should_stop:
+        assert not should_stop()
+        signal.raise_signal(signal.SIGINT)
+        assert should_stop()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before

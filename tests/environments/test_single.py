@@ -449,7 +449,7 @@ def test_an_action_outside_the_box_is_clipped_and_no_number_is_refused():
     [
         ({"speed": 1}, "unknown option 'speed'"),
         ({"x": math.nan}, r"options\['x'\] must be a finite number"),
-        ({"v": 0.1}, "needs options"),
+        ({"v": 0.1}, "only together with options"),
         ({"phase": 1.5}, r"options\['phase'\] must be"),
         ({"phase": 0.5, "x": 0.1}, "exclude one another"),
         ({"start": "nowhere"}, "start must be one of"),

@@ -127,7 +127,7 @@ def test_an_episode_that_ends_early_has_no_late_metrics():
 
 
 def test_metrics_refuse_to_compare_different_episodes():
-    with pytest.raises(ValueError, match="same episodes"):
+    with pytest.raises(ValueError, match="same seeds and length"):
         metrics(PASSIVE, dataclasses.replace(PASSIVE, seeds=np.array([6])))
 
 
@@ -138,9 +138,9 @@ def test_the_score_is_a_ratio_of_means():
     assert score([2.0], [1.0], [2.0]) == 1.0
     # an episode whose optimum nobody knows does not count
     assert score([-50.0, -9.0], [-100.0, -1.0], [-50.0, np.nan]) == 1.0
-    with pytest.raises(ValueError, match="same episodes"):
+    with pytest.raises(ValueError, match="same seeds and length"):
         score([1.0, 2.0], [1.0], [1.0])
-    with pytest.raises(ValueError, match="same episodes"):
+    with pytest.raises(ValueError, match="same seeds and length"):
         score([1.0], [0.0], [np.nan])
     with pytest.raises(ValueError, match="better than passive"):
         score([1.0], [1.0], [1.0])

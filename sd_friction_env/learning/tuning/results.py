@@ -33,7 +33,7 @@ def format_trials(study: optuna.Study, most: int = 10) -> str:
 
 
 def check_out(path: Path) -> None:
-    """Raise unless :func:`write_best` may write a file: an existing one must be one of its own.
+    """Raise unless :func:`write_best` may write a file: an existing one must have been written by it.
 
     Raises:
         ValueError: if it may not.

@@ -20,9 +20,11 @@ def _compared(returns: ArrayLike, passive: ArrayLike, optimal: ArrayLike) -> Arr
         ValueError: if the three are not of one shape, or there is no such episode.
     """
     parts = [np.asarray(values, dtype=float) for values in (returns, passive, optimal)]
-    if len({part.shape for part in parts}) > 1 or parts[0].ndim != 1 or not np.isfinite(parts[2]).any():
+    if len({part.shape for part in parts}) > 1 or parts[0].ndim != 1:
         shapes = ", ".join(str(part.shape) for part in parts)
         raise ValueError(f"returns, passive and optimal must be of the same episodes, got shapes {shapes}")
+    if not np.isfinite(parts[2]).any():
+        raise ValueError(f"optimal must hold the return of one episode or more, got {optimal!r}")
     return np.stack(parts)[:, np.isfinite(parts[2])]
 
 

@@ -217,7 +217,7 @@ class _Supervisor(BaseCallback):
 
     def _on_step(self) -> bool:
         log_episodes(self.locals["infos"], self.locals["dones"], self.logger)
-        if self.bar.n == self.bar.initial:
+        if self.n_calls == 1:
             self.bar.unpause()  # the time left does not count what the first step compiled
         self.bar.update(min(self.num_timesteps, self.plan.steps) - self.bar.n)
         self.stopped = self.stopped or self.should_stop()

@@ -181,6 +181,18 @@ class Task:
         kind = parameters.kind
         return kind._replace(excited=kind.excited or self.show_phases)
 
+    def actuator_of(self, parameters: OscillatorParameters) -> kernel.Actuator:
+        """Return what an action does to this plant, as the kernel takes it."""
+        return kernel.Actuator(
+            ACTUATOR_CODES[self.actuator],
+            self.authority,
+            self.belt_acceleration_limit,
+            parameters.belt_speed,
+            self.control_interval,
+            self.w_effort,
+            self.w_stick,
+        )
+
     def arrays(self) -> tuple[FloatArray, IntegerArray]:
         """Return the task as the kernel takes it: its floats and its codes (:mod:`sd_friction_env.kernel.rows`)."""
         numbers = np.zeros(kernel.TASK_NUMBERS)

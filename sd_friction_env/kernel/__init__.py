@@ -17,6 +17,7 @@ forces - springs, friction, excitation - plant - codes.
 from sd_friction_env.kernel.automaton import *
 from sd_friction_env.kernel.batch import *
 from sd_friction_env.kernel.codes import *
+from sd_friction_env.kernel.control_gradients import *
 from sd_friction_env.kernel.episodes import *
 from sd_friction_env.kernel.events import *
 from sd_friction_env.kernel.excitation import *
@@ -30,7 +31,7 @@ from sd_friction_env.kernel.friction.scaled import *
 from sd_friction_env.kernel.friction.stribeck import *
 from sd_friction_env.kernel.friction.tabulated import *
 from sd_friction_env.kernel.interval import *
-from sd_friction_env.kernel.laws import FRICTION, SPRING, friction_law, spring_law
+from sd_friction_env.kernel.laws import FRICTION, OPTIONAL, SPRING, friction_law, spring_law
 from sd_friction_env.kernel.leaves import *
 from sd_friction_env.kernel.memory import *
 from sd_friction_env.kernel.plant import *
@@ -38,6 +39,7 @@ from sd_friction_env.kernel.random import *
 from sd_friction_env.kernel.return_map import *
 from sd_friction_env.kernel.rows import *
 from sd_friction_env.kernel.runge_kutta import *
+from sd_friction_env.kernel.sensitivity import *
 from sd_friction_env.kernel.slip import *
 from sd_friction_env.kernel.springs.cubic import *
 from sd_friction_env.kernel.springs.discontinuous import *
@@ -46,5 +48,6 @@ from sd_friction_env.kernel.springs.inclined import *
 from sd_friction_env.kernel.springs.linear import *
 from sd_friction_env.kernel.springs.scaled import *
 from sd_friction_env.kernel.stick import *
-from sd_friction_env.kernel.tangent import *
+from sd_friction_env.kernel.stroboscope import *
 from sd_friction_env.kernel.traps import *
+from sd_friction_env.kernel.variation import *

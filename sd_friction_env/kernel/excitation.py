@@ -84,6 +84,9 @@ class Unexcited(NamedTuple):
     def power(self, velocity, potential):
         return 0.0
 
+    def gradient(self, force, position, velocity, inertia, spring):
+        return (0.0,)
+
     def phases(self):
         return NO_PHASES
 
@@ -193,6 +196,32 @@ class Excitation(NamedTuple):
 
     def power(self, velocity, potential):
         return _force(self)[0] * velocity + _stiffness(self)[1] * potential
+
+    def gradient(self, force, position, velocity, inertia, spring):
+        t = self.time
+        angle = self.force_frequency * t + self.force_phase
+        by_force = force * math.cos(angle), -force * self.force_amplitude * math.sin(angle)
+        angle = self.stiffness_frequency * t + self.stiffness_phase
+        by_stiffness = spring * math.cos(angle), -spring * self.stiffness_amplitude * math.sin(angle)
+        rate = self.ripple_frequency
+        angle = rate * t + self.ripple_phase
+        c = math.cos(angle)
+        s = math.sin(angle)
+        displacement = position / rate - inertia * rate  # what the sine of the ripple's phase counts
+        by_phase = self.ripple_amplitude * (displacement * c - velocity * s)
+        by_rate = t * by_phase - self.ripple_amplitude * (position / (rate * rate) + inertia) * s
+        return (
+            by_force[0],
+            t * by_force[1],
+            by_force[1],
+            displacement * s + velocity * c,
+            by_rate,
+            by_phase,
+            by_stiffness[0],
+            t * by_stiffness[1],
+            by_stiffness[1],
+            0.0,
+        )
 
     def phases(self):
         force = self.force_frequency * self.time + self.force_phase

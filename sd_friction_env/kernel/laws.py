@@ -18,6 +18,8 @@ from numba.core.typing.templates import (
     make_overload_template,
 )
 
+from sd_friction_env.kernel.tuples import zeros_of
+
 # As what stands in lanes: without a call left, a loop over lanes becomes vector instructions.
 _OPTIONS: Any = {
     "error_model": "numpy",
@@ -142,6 +144,20 @@ def breakaway_coefficient(self, mode):
 
 @_default
 @_friction
+def coefficient_gradient(self, mode, v_rel):
+    """Return the derivatives of mu(v_rel) by the law's numbers, a tuple in their order."""
+    return zeros_of(self)
+
+
+@_default
+@_friction
+def breakaway_gradient(self, mode):
+    """Return the derivatives of the breakaway coefficient by the law's numbers, a tuple in their order."""
+    return zeros_of(self)
+
+
+@_default
+@_friction
 def layer_width(self, mode):
     """Return over which v_rel friction changes where it changes over less than a step does, or 0."""
     return 0.0
@@ -196,6 +212,27 @@ def normal_slope(self, x):
 def normal_curvature(self, x):
     """Return N''(x)."""
     return 0.0
+
+
+@_default
+@_spring
+def normal_weight_slope(self, x):
+    """Return the derivative of N(x) by the weight."""
+    return 1.0
+
+
+@_default
+@_spring
+def restoring_gradient(self, x):
+    """Return the derivatives of R(x) by the law's numbers, a tuple in their order."""
+    return zeros_of(self)
+
+
+@_default
+@_spring
+def normal_gradient(self, weight, x):
+    """Return the derivatives of N(x) by the law's numbers, a tuple in their order."""
+    return zeros_of(self)
 
 
 @_default
@@ -352,6 +389,13 @@ def roundoff(self):
 @_excitation
 def power(self, velocity, potential):
     """Return the power of the excitation."""
+
+
+@_excitation
+def gradient(self, force, position, velocity, inertia, spring):
+    """Return the derivatives by the excitation's numbers of a sum: ``force`` times the exciting force, ``position``,
+    ``velocity`` and ``inertia`` times the ripple's displacement, speed and acceleration, ``spring`` times the factor of
+    the spring's force."""
 
 
 @_excitation

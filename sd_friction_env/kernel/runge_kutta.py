@@ -22,7 +22,16 @@ class SlipStep(NamedTuple):
     int_fv: float  # and of the contact force's power
 
 
-def _slip_step(plant, mode, state, drive, h):
+class SlipStages(NamedTuple):
+    """A step with its twelve stages."""
+
+    step: SlipStep
+    x: tuple[float, ...]
+    v: tuple[float, ...]
+    contact: tuple[float, ...]  # force
+
+
+def _slip_stages(plant, mode, state, drive, h):
     """Take one step of length h in slip, over which the belt's speed grows linearly."""
     v_belt, a_belt, u = drive
     dv_belt = a_belt * h
@@ -190,7 +199,20 @@ def _slip_step(plant, mode, state, drive, h):
     blend = blend if followed else square3 + 1e-200
     # Where the stages overflow, a finite number over an infinite one would read as no error at all.
     error = h * numerator / math.sqrt(blend) if blend < math.inf else math.inf
-    return SlipStep(x_end, v_end, a1, a12, error, int_v2, int_fv)
+    return SlipStages(
+        SlipStep(x_end, v_end, a1, a12, error, int_v2, int_fv),
+        (x, x2, x3, x4, x5, x6, x7, x8, x9, x10, x11, x12),
+        (v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12),
+        (f1, f2, f3, f4, f5, f6, f7, f8, f9, f10, f11, f12),
+    )
+
+
+slip_stages = uncached_in_lanes(_slip_stages)
+
+
+def _slip_step(plant, mode, state, drive, h):
+    """Take one step of length h in slip, over which the belt's speed grows linearly."""
+    return slip_stages(plant, mode, state, drive, h).step
 
 
 slip_step = compiled(_slip_step)

@@ -8,6 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sd_friction_env import kernel
 from sd_friction_env.kernel import (
     Coulomb,
@@ -353,6 +356,29 @@ class OscillatorParameters:
         """Return the plant in its excited form at a time, even if its amplitudes are 0."""
         plant = plant_of(self.kind._replace(excited=True), self.values)
         return plant._replace(excitation=plant.excitation._replace(time=time))
+
+    def plant_change(self, name: str, *, excited: bool | None = None) -> NDArray[np.float64]:
+        """Return the derivatives of the plant's numbers (``kernel.leaf_names``) by a parameter, of its form by default.
+
+        They are exact: a step of 1e-20 in the imaginary direction has no rounding error (Squire and Trapp, 1998).
+
+        Raises:
+            ValueError: if there is no such parameter, the plant does not use it, or its law offers no derivatives.
+        """
+        kind = self.kind if excited is None else self.kind._replace(excited=excited)
+        if name not in self.values:
+            raise ValueError(f"unknown parameter {name!r}; allowed: {', '.join(self.values)}")
+        plant = plant_of(kind, self.values | {name: complex(self.values[name], 1e-20)})
+        changes = np.imag(np.array(kernel.leaves_of(plant, self.plant if excited is None else None))) / 1e-20
+        if not changes.any():
+            raise ValueError(f"the plant does not use the parameter {name!r}: {self}")
+        for part, law, method in (
+            ("geometry", self.plant.spring, "restoring_gradient"),
+            ("friction", self.plant.friction, "coefficient_gradient"),
+        ):
+            if name.startswith(f"{part}.") and getattr(type(law), method) is kernel.OPTIONAL[method]:
+                raise ValueError(f"the law {type(law).__name__} has no method {method}: no derivative by {name!r}")
+        return changes
 
     def restoring_force(self, x: float) -> float:
         """Return R(x), at time 0."""

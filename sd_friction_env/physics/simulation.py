@@ -1,6 +1,8 @@
 """Simulation in time: samples, events and energy balance of one motion, passive or driven."""
 
+import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -76,6 +78,8 @@ class Trajectory:
         energy: the energy balance.
         status: "ok", "contact lost", "event limit" or "step limit"; the samples end where it stops being "ok".
         parameters: of the oscillator.
+        sensitivities: derivatives of the samples of x and v by what :func:`simulate` was asked for, by name, (n, 2).
+        singular_events: number without a derivative (touched, not passed): sensitivities are not valid after the first.
     """
 
     t: NDArray[np.float64]
@@ -88,6 +92,8 @@ class Trajectory:
     energy: EnergyBalance
     status: str
     parameters: OscillatorParameters
+    sensitivities: Mapping[str, NDArray[np.float64]] = dataclasses.field(default_factory=dict)
+    singular_events: int = 0
 
     def __repr__(self) -> str:
         samples = f"{len(self.t)} samples up to t = {self.t[-1]:.6g}"
@@ -119,6 +125,7 @@ def simulate(
     force: float | ArrayLike = 0.0,
     belt_acceleration: float | ArrayLike = 0.0,
     hold: float | None = None,
+    sensitivities: Sequence[str] = (),
 ) -> Trajectory:
     """Simulate the oscillator from (x, v) at t = 0 to t_end, with its events located exactly.
 
@@ -130,11 +137,14 @@ def simulate(
         force: control force u: a number, or values of shape (m,), each held for ``hold``.
         belt_acceleration: of the belt, likewise.
         hold: duration of each value of an array, in [1e-6, 1e7]; needed with arrays, which must cover t_end.
+        sensitivities: names to differentiate by: "x" and "v" (the start), "force" and "belt_acceleration" (as a whole),
+            and parameters of the oscillator. Where v defaults to the belt speed it changes with it.
 
     Raises:
         TypeError, ValueError: if an argument is not of the type or in the range above.
     """
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
+    rides = v is None
     v = parameters.first_belt_speed if v is None else checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
     t_end = checked_number("t_end", t_end, 0.0, 1e7)
     dt = checked_number("dt", dt, 1e-6, 1e6)
@@ -147,7 +157,8 @@ def simulate(
     segments = max(forces.size, accelerations.size)
     grid: NDArray[Any] = dt * np.arange(math.floor(t_end / dt * (1.0 + 1e-12)) + 1)
     grid = np.append(grid[grid < t_end * (1.0 - 1e-12)], t_end) if t_end > 0.0 else np.zeros(1)
-    run = _Run(parameters, x, v, float(forces[0]), float(accelerations[0]))
+    rates = _Rates(parameters, sensitivities, rides=rides) if sensitivities else None
+    run = _Run(parameters, x, v, float(forces[0]), float(accelerations[0]), rates)
     segment, begin = 0, 0.0
     while begin < t_end and run.status == kernel.OK:
         end = t_end if segment + 1 >= segments else min(t_end, (segment + 1) * hold)
@@ -162,8 +173,10 @@ def simulate(
 class _Run:
     """A simulation in progress: the state, and what has been recorded and integrated so far."""
 
-    def __init__(self, parameters: OscillatorParameters, x: float, v: float, u: float, a_belt: float) -> None:
-        self.parameters, self.plant = parameters, parameters.plant
+    def __init__(
+        self, parameters: OscillatorParameters, x: float, v: float, u: float, a_belt: float, rates: "_Rates | None"
+    ) -> None:
+        self.parameters, self.plant, self.rates = parameters, parameters.plant, rates
         self.x, self.v, self.belt = x, v, parameters.belt_speed
         self.status, self.mode, self.drive = kernel.OK, kernel.UNKNOWN, (0.0, 0.0)
         self.start_energy = 0.5 * v * v + kernel.energy_in_spring(self.plant, x)
@@ -193,6 +206,8 @@ class _Run:
             elif at_end:
                 stamps[-1] = end
             keep = taken - 1 if extra and self.status == kernel.OK and at_end else taken
+            if self.rates:
+                self.rates.keep(taken, keep)
             self.parts.append(np.column_stack((stamps[:keep], samples[:keep])))
             t0 = float(stamps[-1])
             done += taken
@@ -205,6 +220,8 @@ class _Run:
         samples = np.empty((piece.size, 4))
         buffer = np.empty((max(4 * kernel.MAX_EVENTS, piece.size), 4))
         now = kernel.at_time(self.plant, t0)
+        if self.rates:
+            self.rates.trace(now, self.mode, state, drive, piece)
         taken, n_events, self.status, reached, int_v2, stuck, int_fv = kernel.trace(
             now, self.mode, state, drive, piece, samples, buffer
         )
@@ -241,7 +258,54 @@ class _Run:
             ),
             status=kernel.STATUS_NAMES[self.status],
             parameters=p,
+            sensitivities=self.rates.by_name() if self.rates else {},
+            singular_events=self.rates.singular if self.rates else 0,
         )
+
+
+class _Rates:
+    """The tangents of a simulation in progress, in named directions."""
+
+    def __init__(self, parameters: OscillatorParameters, names: Sequence[str], *, rides: bool) -> None:
+        if isinstance(names, str) or len(set(names)) < len(names):
+            raise ValueError(f"sensitivities must be different names, got {names!r}")
+        starts = {"x": kernel.TANGENT_X, "v": kernel.TANGENT_V, "force": kernel.TANGENT_U}
+        starts |= {"belt_speed": kernel.TANGENT_BELT, "belt_acceleration": kernel.TANGENT_A_BELT}
+        self.names = tuple(names)
+        self.ordered = sorted(names, key=lambda name: name not in starts)  # those that change the plant are the last
+        self.tangents = np.zeros((kernel.TANGENT_ROWS, len(names)))
+        changes = []
+        # The speed of a mass that rides with the belt at first.
+        angle, size = parameters.ripple_phase, parameters.ripple_amplitude
+        riding = {"belt_speed": 1.0, "ripple_amplitude": math.cos(angle), "ripple_phase": -size * math.sin(angle)}
+        for column, name in enumerate(self.ordered):
+            if name in starts:
+                self.tangents[starts[name], column] = 1.0
+            else:
+                changes.append(parameters.plant_change(name))
+            if rides:
+                self.tangents[kernel.TANGENT_V, column] += riding.get(name, 0.0)
+        self.directions = np.array(changes) if changes else None
+        self.parts = [self.tangents[None, :2].copy()]
+        self.singular = 0
+
+    def trace(self, plant: Any, mode: int, state: Any, drive: Any, times: NDArray[np.float64]) -> None:
+        """Follow the tangents through a piece of sample times."""
+        samples = np.full((times.size, 2, len(self.names)), math.nan)
+        _, touched = kernel.trace_with_tangents(
+            plant, mode, state, drive, times, self.tangents, self.directions, samples
+        )
+        self.singular += touched
+        self.parts.append(samples)
+
+    def keep(self, taken: int, kept: int) -> None:
+        """Drop those of the last samples that are not kept, or not taken."""
+        self.parts[-1] = self.parts[-1][: min(taken, kept)]
+
+    def by_name(self) -> dict[str, NDArray[np.float64]]:
+        """Return the derivatives of x and v, (n, 2), by name."""
+        samples = np.concatenate(self.parts)
+        return {name: samples[:, :, self.ordered.index(name)] for name in self.names}
 
 
 def _checked_hold(hold: float | None, t_end: float, drives: dict[str, NDArray[np.float64]]) -> float:

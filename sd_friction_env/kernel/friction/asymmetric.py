@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 from sd_friction_env.kernel.laws import friction_law
+from sd_friction_env.kernel.tuples import zeros_of
 
 
 @friction_law
@@ -41,3 +42,13 @@ class Asymmetric(NamedTuple):
         if mode > 0:
             return self.forward.layer_width(mode)
         return self.backward.layer_width(mode)
+
+    def coefficient_gradient(self, mode, v_rel):
+        if mode > 0:
+            return zeros_of(self.backward) + self.forward.coefficient_gradient(mode, v_rel)
+        return self.backward.coefficient_gradient(mode, v_rel) + zeros_of(self.forward)
+
+    def breakaway_gradient(self, mode):
+        if mode > 0:
+            return zeros_of(self.backward) + self.forward.breakaway_gradient(mode)
+        return self.backward.breakaway_gradient(mode) + zeros_of(self.forward)

@@ -23,3 +23,9 @@ class Coulomb(NamedTuple):
 
     def third_derivative(self, mode, v_rel):
         return 0.0
+
+    def coefficient_gradient(self, mode, v_rel):
+        return 0.0, float(mode)
+
+    def breakaway_gradient(self, mode):
+        return 1.0, 0.0

@@ -34,3 +34,11 @@ class Exponential(NamedTuple):
 
     def layer_width(self, mode):
         return self.v_0
+
+    def coefficient_gradient(self, mode, v_rel):
+        fall = math.exp(min(-(mode * v_rel) / self.v_0, HUGE_EXPONENT))
+        by_speed = (self.mu_s - self.mu_k) * fall * v_rel / (self.v_0 * self.v_0)
+        return mode * fall, mode * (1.0 - fall), by_speed, v_rel
+
+    def breakaway_gradient(self, mode):
+        return 1.0, 0.0, 0.0, 0.0

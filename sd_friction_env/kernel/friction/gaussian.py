@@ -34,3 +34,12 @@ class Gaussian(NamedTuple):
 
     def layer_width(self, mode):
         return self.v_0
+
+    def coefficient_gradient(self, mode, v_rel):
+        w = v_rel / self.v_0
+        fall = math.exp(-(w * w))
+        by_speed = 2.0 * mode * (self.mu_s - self.mu_k) * fall * (w * w) / self.v_0
+        return mode * fall, mode * (1.0 - fall), by_speed, v_rel
+
+    def breakaway_gradient(self, mode):
+        return 1.0, 0.0, 0.0, 0.0

@@ -31,3 +31,10 @@ class Hyperbolic(NamedTuple):
 
     def layer_width(self, mode):
         return 1.0 / max(self.delta, 1e-300)
+
+    def coefficient_gradient(self, mode, v_rel):
+        below = 1.0 + self.delta * (mode * v_rel)
+        return mode / below, -self.mu_s * v_rel / (below * below), v_rel
+
+    def breakaway_gradient(self, mode):
+        return 1.0, 0.0, 0.0

@@ -29,3 +29,10 @@ class ScaledFriction(NamedTuple):
 
     def layer_width(self, mode):
         return self.law.layer_width(mode) / self.unit
+
+    def coefficient_gradient(self, mode, v_rel):
+        by_unit = v_rel * self.law.slope(mode, self.unit * v_rel)
+        return (*self.law.coefficient_gradient(mode, self.unit * v_rel), by_unit)
+
+    def breakaway_gradient(self, mode):
+        return (*self.law.breakaway_gradient(mode), 0.0)

@@ -27,3 +27,9 @@ class Stribeck(NamedTuple):
 
     def may_be_steep(self):
         return False
+
+    def coefficient_gradient(self, mode, v_rel):
+        return float(mode), -v_rel, v_rel * v_rel * v_rel
+
+    def breakaway_gradient(self, mode):
+        return 1.0, 0.0, 0.0

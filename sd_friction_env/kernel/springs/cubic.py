@@ -45,3 +45,11 @@ class Cubic(NamedTuple):
 
     def may_be_stiff(self):
         return False
+
+    def restoring_gradient(self, x):
+        y = x / self.alpha
+        return ((y - 1.5 * (y * y * y)) / self.alpha,)
+
+    def normal_gradient(self, weight, x):
+        y = x / self.alpha
+        return (y * y / self.alpha - 1.0,)

@@ -23,3 +23,6 @@ class Duffing(NamedTuple):
 
     def potential(self, x):
         return 0.5 * self.linear_stiffness * (x * x) + 0.25 * self.kappa * (x * x * x * x)
+
+    def restoring_gradient(self, x):
+        return x, x * x * x

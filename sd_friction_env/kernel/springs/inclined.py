@@ -48,3 +48,11 @@ class Inclined(NamedTuple):
 
     def may_be_stiff(self):
         return False
+
+    def restoring_gradient(self, x):
+        length = math.sqrt(x * x + self.alpha * self.alpha)
+        return (x * self.alpha / (length * length * length),)
+
+    def normal_gradient(self, weight, x):
+        length = math.sqrt(x * x + self.alpha * self.alpha)
+        return (x * x / (length * length * length) - 1.0,)

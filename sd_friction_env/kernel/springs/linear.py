@@ -25,3 +25,6 @@ class Linear(NamedTuple):
 
     def may_be_stiff(self):
         return False
+
+    def restoring_gradient(self, x):
+        return (x,)

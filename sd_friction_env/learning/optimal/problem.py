@@ -13,7 +13,7 @@ from sd_friction_env import kernel
 from sd_friction_env.environments import ids
 from sd_friction_env.environments.ids import environment_id
 from sd_friction_env.environments.single import SDFrictionEnv
-from sd_friction_env.environments.task import ACTUATOR_CODES, Task
+from sd_friction_env.environments.task import Task
 from sd_friction_env.physics.parameters import OscillatorParameters
 
 Array = NDArray[np.float64]
@@ -114,7 +114,7 @@ def step_plant(task: Task, parameters: OscillatorParameters, states: Array, acti
     rewards = np.empty(columns.shape[1])
     failures = kernel.control_intervals(
         parameters.plant,
-        _actuator(task, parameters),
+        task.actuator_of(parameters),
         *columns,
         np.ascontiguousarray(actions.reshape(-1)),
         *ends,
@@ -135,18 +135,6 @@ def make_problem(env_id: str, seeds: Sequence[int]) -> Problem:
         starts[i] = info["x"], info["v"], info["v_belt"]
         parameters.append(env.parameters)
     return Problem(env_id, env.task, tuple(parameters), starts)
-
-
-def _actuator(task: Task, parameters: OscillatorParameters) -> kernel.Actuator:
-    return kernel.Actuator(
-        ACTUATOR_CODES[task.actuator],
-        task.authority,
-        task.belt_acceleration_limit,
-        parameters.belt_speed,
-        task.control_interval,
-        task.w_effort,
-        task.w_stick,
-    )
 
 
 def make_bare_env(env_id: str) -> SDFrictionEnv:

@@ -99,7 +99,7 @@ def _passive_exponent(cycle: LimitCycle) -> LyapunovExponent:
     if cycle.kind == "pure-slip":
         strobe = Stroboscope(cycle.parameters, cycle.period)
         end, tangent = lap_with_tangents(strobe, (cycle.x_phase0, cycle.v_phase0), 1)
-        singular = int(end.singular_events)
+        singular = int(end.touched)
         # One multiplier is 1, along the flow.
         largest = math.log(abs(float(np.linalg.det(tangent)))) / cycle.period
         exponents = (0.0, largest) if largest < 0.0 else (largest, 0.0)

@@ -109,15 +109,35 @@ def forced_orbit(
     raise OrbitError(f"the motion from x = {x!r} does not settle on an orbit of multiple up to {most}; {parameters}")
 
 
-def lap_with_tangents(
-    strobe: Stroboscope, state: tuple[float, float], multiple: int, *, in_sections: bool = True
-) -> tuple[Any, FloatArray]:
-    """Return where ``kernel.integrate_with_tangents`` ends after ``multiple`` periods, and the tangent map (2, 2)."""
-    vectors = np.eye(2)
+def lap_with_tangents(strobe: Stroboscope, state: tuple[float, float], multiple: int) -> tuple[Any, FloatArray]:
+    """Return where ``multiple`` periods from a state end (``kernel.TangentMotion``), and the tangent map, (2, 2)."""
+    tangents = np.zeros((kernel.TANGENT_ROWS, 2))
+    tangents[kernel.TANGENT_X, 0] = tangents[kernel.TANGENT_V, 1] = 1.0
+    return _advance(strobe, state, multiple * strobe.period, tangents), tangents[:2]
+
+
+def _advance(strobe: Stroboscope, state: tuple[float, float], duration: float, tangents: FloatArray) -> Any:
+    belt = kernel.steady(strobe.parameters.belt_speed)
+    start = kernel.State(*map(float, state))
+    return kernel.advance_with_tangents(strobe.plant, kernel.UNKNOWN, start, belt, duration, tangents, None)
+
+
+def _end(strobe: Stroboscope, state: tuple[float, float], duration: float) -> tuple[float, float] | None:
+    end = _advance(strobe, state, duration, np.empty((kernel.TANGENT_ROWS, 0)))
+    return (end.x, end.v) if end.status == kernel.OK else None
+
+
+def time_away_from_events(strobe: Stroboscope, state: tuple[float, float], multiple: int) -> float:
+    """Return the middle of the longest stretch without an event in ``multiple`` periods from a state.
+
+    A section that falls on an event has no derivative; multipliers are those of any other section of the orbit.
+    """
     events = np.empty((kernel.MAX_EVENTS, 4))
-    belt_speed, duration = strobe.parameters.belt_speed, multiple * strobe.period
-    end = kernel.integrate_with_tangents(strobe.plant, *state, belt_speed, duration, events, vectors, in_sections)
-    return end, vectors.T
+    belt, duration = kernel.steady(strobe.parameters.belt_speed), multiple * strobe.period
+    motion = kernel.advance(strobe.plant, kernel.State(*map(float, state)), belt, duration, events)
+    times = np.concatenate(([0.0], events[: motion.n_events, 0], [motion.time]))
+    longest = int(np.argmax(np.diff(times)))
+    return float(0.5 * (times[longest] + times[longest + 1])) if motion.n_events else 0.0
 
 
 def _converged_state(strobe: Stroboscope, state: tuple[float, float], multiple: int) -> tuple[float, float] | None:
@@ -125,7 +145,7 @@ def _converged_state(strobe: Stroboscope, state: tuple[float, float], multiple: 
     start = np.array(state)
     for _ in range(_NEWTON_STEPS):
         place = float(start[0]), float(start[1])
-        end, tangent = lap_with_tangents(strobe, place, multiple, in_sections=False)
+        end, tangent = lap_with_tangents(strobe, place, multiple)
         if end.status != kernel.OK:
             return None
         error = np.array(end[:2]) - start
@@ -142,10 +162,14 @@ def _converged_state(strobe: Stroboscope, state: tuple[float, float], multiple: 
 
 def _closed_orbit(strobe: Stroboscope, state: tuple[float, float], multiple: int) -> ForcedOrbit | None:
     """Return the orbit of this multiple, or of a divisor, that Newton's method finds from a state, or None."""
-    start = _converged_state(strobe, state, multiple)
-    if start is None:
+    time = time_away_from_events(strobe, state, multiple)
+    away = strobe._replace(phase=strobe.phase + time / strobe.period)
+    begin = _end(strobe, state, time)
+    found = None if begin is None else _converged_state(away, begin, multiple)
+    start = None if found is None else _end(away, found, multiple * strobe.period - time)
+    if found is None or start is None:
         return None
-    end, tangent = lap_with_tangents(strobe, start, multiple)
+    end, tangent = lap_with_tangents(away, found, multiple)
     points = np.concatenate((np.array([start]), strobe.follow(start, 0, multiple).rows[:-1, :2]))
     for divisor in range(1, multiple):
         if multiple % divisor == 0 and np.abs(points[divisor] - points[0]).max() < 10.0 * _CONVERGED:
@@ -169,6 +193,6 @@ def _closed_orbit(strobe: Stroboscope, state: tuple[float, float], multiple: int
         forward_arcs=end.forward_arcs,
         multipliers=(first, second),
         stable=abs(first) < 1.0,
-        singular_events=end.singular_events,
+        singular_events=end.touched,
         parameters=strobe.parameters,
     )

@@ -5,13 +5,31 @@ python scripts/derivatives.py --only accuracy  one of: accuracy, multipliers, ex
 python scripts/derivatives.py --motions 200    fewer motions
 """
 
+import argparse
+import itertools
 import math
+import statistics
+import time
 from typing import Any, NamedTuple
 
+import gymnasium as gym
+import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import mathieu_a, mathieu_b
 
-from sd_friction_env import OscillatorParameters, kernel, tabulated_friction
+from sd_friction_env import (
+    OrbitError,
+    OscillatorParameters,
+    Task,
+    critical_belt_speeds,
+    kernel,
+    limit_cycle,
+    simulate,
+    tabulated_friction,
+)
+from sd_friction_env.environments.jacobian import return_with_gradient, step_with_jacobian
+from sd_friction_env.physics.forced import drive_period, forced_orbit, lyapunov_exponent
 from sd_friction_env.physics.laws import Asymmetric, Coulomb, Exponential
 
 Array = NDArray[np.float64]
@@ -219,7 +237,256 @@ def accuracy(motions: int, seed: int = 0) -> None:
         print(f"  {law:12} {len(own):5} motions  median {middle:.1e}  worst {worst:.1e}  over 1e-9: {over}")
 
 
-if __name__ == "__main__":
-    import sys
+def multipliers() -> None:
+    """Compare Floquet multipliers with closed forms."""
+    print("multipliers, largest error")
+    # Without friction and damping: exp(+- i T), modulus 1.
+    worst = 0.0
+    for rate in (0.37, 0.8, 1.3, 2.9):
+        p = OscillatorParameters(
+            geometry="linear", mu_s=0.0, mu_m=0.0, beta=0.0, force_amplitude=0.3, force_frequency=rate
+        )
+        found = sorted(tangent_map(p, 1.0, 0.2)[1], key=np.imag)
+        exact = np.exp(np.array([-1j, 1j]) * 2.0 * math.pi / rate)
+        worst = max(worst, float(np.abs(found - np.array(sorted(exact, key=np.imag))).max()))
+    print(f"  linear, undamped (exp(+-iT)): {worst:.1e}")
+    # Edges of the Mathieu equation's tongues: the trace is 2 or -2.
+    worst, edges = 0.0, 0
+    for order, q in itertools.product(range(1, 5), (0.05, 0.2, 0.4)):
+        for edge in (mathieu_a, mathieu_b):
+            a = float(edge(order, q))
+            if not 0.0 < 2.0 * q / a <= 1.0:
+                continue
+            edges += 1
+            p = OscillatorParameters(
+                geometry="linear",
+                mu_s=0.0,
+                mu_m=0.0,
+                beta=0.0,
+                stiffness_amplitude=2.0 * q / a,
+                stiffness_frequency=2.0 / math.sqrt(a),
+            )
+            found = tangent_map(p, 1.0, 0.2)[0]
+            worst = max(worst, abs(abs(float(np.trace(found))) - 2.0))
+    print(f"  edges of Mathieu's tongues (trace 2, -2), {edges} of them: {worst:.1e}")
+    # Coulomb friction on a standing floor, symmetric motion: det = exp(-2 beta T) and the ratios at the two reversals.
+    worst = 0.0
+    for rate, friction, beta in itertools.product((0.8, 1.3, 1.7), (0.1, 0.3), (0.02, 0.1)):
+        p = OscillatorParameters(
+            geometry="linear",
+            friction="coulomb",
+            mu_s=friction,
+            mu_k=friction,
+            beta=beta,
+            belt_speed=0.0,
+            force_amplitude=1.0,
+            force_frequency=rate,
+        )
+        orbit = forced_orbit(p, 1.5, 0.0, transient=2000)
+        squared = math.exp(-2.0 * beta * orbit.period)
+        for event in simulate(p, orbit.x, orbit.v, orbit.period, dt=0.1).events:
+            rest = math.cos(rate * event.time) - event.x
+            squared *= (abs(rest) - friction) / (abs(rest) + friction)
+        worst = max(worst, abs(abs(orbit.multipliers[0] * orbit.multipliers[1]) - squared))
+    print(f"  Coulomb (Shaw 1986), product of both, 12 oscillators: {worst:.1e}")
+    # Pure slip without excitation: one multiplier is 1, the other the slope of the map of maxima.
+    worst, cycles = 0.0, 0
+    for alpha in (0.7, 0.8, 1.0):
+        p = OscillatorParameters(alpha=alpha)
+        v_b0, v_b1 = critical_belt_speeds(p)
+        for share in (0.3, 0.6, 0.9):
+            cycle = limit_cycle(p.replace(belt_speed=v_b0 + share * (v_b1 - v_b0)))
+            found = tangent_map(cycle.parameters, cycle.x_phase0, cycle.v_phase0, cycle.period)[0]
+            plant, speed, traps = cycle.parameters.plant, cycle.parameters.belt_speed, np.empty((0, kernel.TRAP_ROW))
+            step = 1e-3 * (cycle.x_max - cycle.x_min)
+            maxima = [kernel.next_maximum(plant, speed, cycle.x_max + k * step, traps).x for k in (-2, -1, 1, 2)]
+            slope = (8.0 * (maxima[2] - maxima[1]) - (maxima[3] - maxima[0])) / (12.0 * step)
+            if math.isfinite(slope):
+                worst, cycles = max(worst, abs(float(np.linalg.det(found)) - slope)), cycles + 1
+    print(f"  pure slip, against the slope of the return map (fourth-order differences), {cycles} cycles: {worst:.1e}")
 
-    accuracy(int(sys.argv[1]))
+
+def tangent_map(p: OscillatorParameters, x: float, v: float, duration: float | None = None) -> tuple[Array, Array]:
+    """Return the tangent map over a period of the excitation, (2, 2), and its eigenvalues."""
+    tangents = np.zeros((kernel.TANGENT_ROWS, 2))
+    tangents[kernel.TANGENT_X, 0] = tangents[kernel.TANGENT_V, 1] = 1.0
+    duration = drive_period(p) if duration is None else duration
+    state, belt = kernel.State(x, v), kernel.steady(p.belt_speed)
+    kernel.advance_with_tangents(p.excited_plant(0.0), kernel.UNKNOWN, state, belt, duration, tangents, None)
+    return tangents[:2], np.linalg.eigvals(tangents[:2])
+
+
+def exponents() -> None:
+    """Compare the sum of both exponents with the mean divergence and the determinants of the saltations."""
+    worst, counted = 0.0, 0
+    for friction, excitation in itertools.product(("stribeck", "hyperbolic", "coulomb"), ("force", "ripple")):
+        for amplitude in (0.8, 1.2):
+            p = OscillatorParameters(
+                friction=friction, mu_k=0.1, alpha=0.8, belt_speed=0.1, g1=1.0,
+                **{f"{excitation}_amplitude": amplitude, f"{excitation}_frequency": 1.7},
+            )  # fmt: skip
+            cycles = 40
+            try:
+                found = lyapunov_exponent(p, 0.9, 0.3, cycles=cycles, transient=0)
+                motion = simulate(p, 0.9, 0.3, cycles * drive_period(p), dt=0.01)
+            except OrbitError:
+                continue
+            if motion.stick_time > 0.0:
+                continue
+            counted += 1
+            worst = max(worst, abs(sum(found.exponents) - mean_divergence(p, motion)))
+    print(f"sum of exponents against divergence and saltation determinants, {counted} motions: {worst:.1e}")
+
+
+def mean_divergence(p: OscillatorParameters, motion: Any) -> float:
+    """Return the mean rate at which areas grow along a motion without sticks: in slip, and by its crossings."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    total = 0.0
+    times = [0.0, *(event.time for event in motion.events), float(motion.t[-1])]
+    states = [(motion.x[0], motion.v[0]), *((event.x, event.v) for event in motion.events)]
+    belt = kernel.steady(p.belt_speed)
+    for i, (begin, end) in enumerate(itertools.pairwise(times)):
+        pieces = int((end - begin) / 0.2) + 1
+        length = (end - begin) / pieces
+        now = kernel.at_time(p.plant, begin)
+        # From just inside the leg: at its first state friction has two values.
+        mode = kernel.advance(now, kernel.State(*states[i]), belt, 0.5 * length, None).mode
+        for k, (node, weight) in itertools.product(range(pieces), zip(nodes, weights, strict=True)):
+            t = (k + 0.5 * (1.0 + node)) * length
+            here = kernel.advance(now, kernel.State(*states[i]), belt, t, None)
+            there = kernel.at_time(p.plant, begin + t)
+            _, v = there.excitation.to_belt_frame(here.x, here.v, p.belt_speed)
+            slope = there.friction.slope(mode, v - p.belt_speed)
+            total -= 0.5 * length * weight * (2.0 * p.beta + slope * kernel.normal_force(there, here.x))
+        if i + 1 < len(states):
+            then = kernel.at_time(p.plant, end)
+            x_belt, _ = then.excitation.to_belt_frame(*states[i + 1], p.belt_speed)
+            a, after = (
+                kernel.slip_acceleration(then, side, kernel.State(x_belt, p.belt_speed), belt) for side in (mode, -mode)
+            )
+            total += math.log(abs(after / a))
+    return total / times[-1]
+
+
+def cost() -> None:
+    """Measure what derivatives by state and action cost, in one interleaved run."""
+    rng, n = np.random.default_rng(0), 8192
+    p = OscillatorParameters()
+    print("cost of a step with its Jacobian by x, v, v_belt and action, over the plain step (medians of 15)")
+    for task in (Task(), Task(actuator="belt_speed")):
+        actuator = task.actuator_of(p)
+        env = gym.make_vec(
+            f"SDFriction/{'Force' if task.actuator == 'force' else 'BeltSpeed'}-v0",
+            num_envs=n,
+            vectorization_mode="vector_entry_point",
+        )
+        env.reset(seed=0)
+        for _ in range(100):
+            actions = rng.uniform(-1.0, 1.0, (n, 1)).astype(np.float32)
+            env.step(actions)
+        states = env.get_states()
+        starts = np.array(
+            [[s.x, s.v, s.v_belt, action] for s, action in zip(states, rng.uniform(-1.0, 1.0, n), strict=True)]
+        )
+        starts = np.ascontiguousarray(starts.T)
+        outcomes, jacobians, codes = np.empty((n, 11)), np.empty((n, 11, 4)), np.empty((2, n), np.int64)
+        ends = [np.empty(n) for _ in range(4)]
+        state, action = starts[:3, 0].copy(), float(starts[3, 0])
+        alone = [np.ascontiguousarray(row[:1]) for row in starts]
+        runs: dict[str, Any] = {
+            "plain": lambda a=actuator, s=starts, e=ends: kernel.control_intervals(p.plant, a, *s, *e),
+            "jacobian": lambda a=actuator, s=starts, o=outcomes, j=jacobians, c=codes: (
+                kernel.control_intervals_with_tangents(p.plant, a, s, None, np.empty(0), o, j, c)
+            ),
+            "vector env": lambda e=env, a=actions: e.step(a),
+            "one plain": lambda a=actuator, s=alone, e=ends: [
+                kernel.control_intervals(p.plant, a, *s, *(end[:1] for end in e)) for _ in range(200)
+            ],
+            "one": lambda s=state, a=action, t=task: [step_with_jacobian(s, a, p, t) for _ in range(200)],
+        }
+        times = interleaved(runs, 15)
+        print(
+            f"  {task.actuator}: {n} states, one by one in compiled code: {times['jacobian'] / times['plain']:.2f}x "
+            f"({times['jacobian'] / n * 1e9:.0f} ns); over the vector environment's step: "
+            f"{times['jacobian'] / times['vector env']:.1f}x; one state from Python: "
+            f"{times['one'] / times['one plain']:.2f}x ({times['one'] / 200 * 1e6:.1f} us)"
+        )
+
+
+def interleaved(runs: dict[str, Any], repeats: int) -> dict[str, float]:
+    """Return the median duration of each function, run in turn."""
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for run in runs.values():
+        run()
+    for _ in range(repeats):
+        for name, run in runs.items():
+            begin = time.perf_counter()
+            run()
+            times[name].append(time.perf_counter() - begin)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+@numba.njit
+def plain_return(plant: Any, actuator: Any, x: float, v: float, v_belt: float, actions: Array) -> float:
+    """Return the sum of rewards of an action sequence."""
+    total = 0.0
+    kind, authority, a_limit, belt_speed, interval, w_effort, w_stick = actuator
+    for action in actions:
+        u, a_belt = kernel.actuation(kind, authority, a_limit, belt_speed, interval, v_belt, action)
+        drive = kernel.Drive(v_belt, a_belt, u)
+        end = kernel.follow(plant, kernel.UNKNOWN, kernel.State(x, v), drive, interval, None, kernel.UNTRIED)
+        averages = kernel.interval_averages(
+            x, end.x, end.int_v2, end.stick_time, end.int_fv, action, u, belt_speed, interval, w_effort, w_stick
+        )
+        total += averages.vibration + averages.effort + averages.stick
+        x, v, v_belt = end.x, end.v, end.v_belt
+    return total
+
+
+def gradient() -> None:
+    """Measure the gradient of a 500-step return in its actions against the plain compiled rollout."""
+    p, rng = OscillatorParameters(), np.random.default_rng(0)
+    for task in (Task(), Task(actuator="belt_speed")):
+        actuator, actions = task.actuator_of(p), rng.uniform(-0.3, 0.3, 500)
+        state = np.array([0.5, -0.3, 0.2])
+        found = return_with_gradient(state, actions, p, task)
+        plain = plain_return(p.plant, actuator, 0.5, -0.3, 0.2, actions)
+        assert found.total == plain
+        runs: dict[str, Any] = {
+            "plain": lambda a=actuator, b=actions: plain_return(p.plant, a, 0.5, -0.3, 0.2, b),
+            "gradient": lambda b=actions, t=task, s=state: return_with_gradient(s, b, p, t),
+        }
+        times = interleaved(runs, 101)
+        ratio = times["gradient"] / times["plain"]
+        checked = [0, 50, 250, 499]
+        differences = []
+        for k in checked:
+            step = np.zeros(500)
+            step[k] = 1e-6
+            up, down = (plain_return(p.plant, actuator, 0.5, -0.3, 0.2, actions + s * step) for s in (1.0, -1.0))
+            differences.append((up - down) / 2e-6)
+        error = np.abs(found.by_actions[checked] - differences).max() / np.abs(found.by_actions).max()
+        print(
+            f"gradient of a 500-step return in its 500 actions, {task.actuator}: {ratio:.1f}x the plain rollout "
+            f"({times['gradient'] * 1e6:.0f} us); differences from central ones of 1e-6: {error:.0e}"
+        )
+
+
+PARTS = {
+    "accuracy": accuracy, "multipliers": multipliers, "exponents": exponents, "cost": cost, "gradient": gradient
+}  # fmt: skip
+
+
+def main() -> None:
+    """Print what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=PARTS, help="one part")
+    parser.add_argument("--motions", type=int, default=2000, help="of accuracy (default %(default)s)")
+    options = parser.parse_args()
+    for name, part in PARTS.items():
+        if options.only in (None, name):
+            part(options.motions) if name == "accuracy" else part()
+
+
+if __name__ == "__main__":
+    main()

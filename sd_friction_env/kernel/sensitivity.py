@@ -61,7 +61,7 @@ from sd_friction_env.kernel.variation import (
 _NO_STAGES = SlipStages(SlipStep(*(0.0,) * 7), *((0.0,) * 12,) * 3)
 _MOST_CALLS = 256  # of the automaton in one motion, each of MAX_EVENTS events
 _SECTION_TIME = 1e-8  # an event this close to the start or the end falls on it
-_TOUCH = 1e-8  # a surface met at no more than this rate is touched, not passed
+_TOUCH = 1e-8  # a surface met at no more than this rate, or neared this closely, is touched, not passed
 
 # Whether the derivative exists; of several reasons why not, the greatest.
 SMOOTH, FROM_BELT, AT_BORDER, TOUCHED = 0, 1, 2, 3
@@ -268,11 +268,13 @@ def follow_with_tangents(plant, mode, state, drive, duration, tangents, directio
                     tangents[TANGENT_V, j] = tangents[TANGENT_BELT, j]
                 x_leg, v_leg = carry_in_stick(leg, x_leg, at_begin, end - begin, tangents, directions, work)
             else:
-                done, x_leg, v_leg = carry_in_slip(
+                done, nearest, x_leg, v_leg = carry_in_slip(
                     leg, mode, State(x_leg, v_leg), at_begin, end - begin, tangents, directions, work, known, stages
                 )
                 if not done:
                     status = STEP_LIMIT
+                if nearest <= _TOUCH:
+                    touched += 1
             then = at_time(now, end)
             at_end = drive_at(there, end)
             if n < motion.n_events:

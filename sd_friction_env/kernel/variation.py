@@ -11,9 +11,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sd_friction_env.kernel import tableau
-from sd_friction_env.kernel.codes import MAX_SLIP_STEP, MIN_SLIP_STEP, SLIP_TRIALS, STEP_DOUBLING, STIFF
+from sd_friction_env.kernel.codes import (
+    MAX_SLIP_STEP,
+    MIN_SLIP_STEP,
+    SLIP_TRIAL_RATE,
+    SLIP_TRIALS,
+    STEP_DOUBLING,
+    STIFF,
+    TOLERANCE,
+    V_REL_ZERO,
+)
 from sd_friction_env.kernel.compilation import compiled, in_lanes, reader
-from sd_friction_env.kernel.events import leaps_over_layer
+from sd_friction_env.kernel.events import Surface, find_double_crossing, leaps_over_layer, look_at
 from sd_friction_env.kernel.forces import normal_force, normal_slope, restoring_slope, roundoff_floor, stick_load
 from sd_friction_env.kernel.plant import State, at_time, drive_at, select_field
 from sd_friction_env.kernel.plant_gradients import contact_gradient, external_gradient, ripple_gradient
@@ -26,7 +35,7 @@ from sd_friction_env.kernel.stick import NODES, WEIGHTS, ridden
 (TANGENT_X, TANGENT_V, TANGENT_BELT, TANGENT_A_BELT, TANGENT_U, TANGENT_V2, TANGENT_STICK, TANGENT_FV) = range(8)
 TANGENT_ROWS = 8
 _STAGES = 12
-TANGENT_TOLERANCE = 1e-12  # estimated error per unit of time, of a step and of its tangents, relative to their size
+TANGENT_TOLERANCE = 1e-9  # estimated error per unit of time of a tangent, relative to its size
 _C = tuple(getattr(tableau, f"C{i}", 0.0) for i in range(1, _STAGES + 1))
 
 
@@ -35,7 +44,7 @@ _C = tuple(getattr(tableau, f"C{i}", 0.0) for i in range(1, _STAGES + 1))
 _BLOCK, _LANES = 16, 8  # tangents are stepped in blocks, so many of them side by side
 _SOURCE_ROW = 5
 _END_ROW = _SOURCE_ROW + 3 * _STAGES
-_ROWS = _END_ROW + 5  # x, v, the changes of the integrals of v^2 and of the power, the estimated error
+_ROWS = _END_ROW + 6  # x, v, the changes of the integrals of v^2 and of the power, the estimated error, dv/dt at first
 
 
 class Work(NamedTuple):
@@ -87,7 +96,10 @@ def _column_source():
     body += ["fifth = E5x * E5x + E5v * E5v", "third = E3x * E3x + E3v * E3v"]
     for r, (start, letter) in enumerate((("x + ", "v"), ("v + ", "a"), ("", "p"), ("", "q"))):
         body += [f"{lane(_END_ROW + r)} = {start}h * ({total(letter, row('B'))})"]
-    body += [f"{lane(_END_ROW + 4)} = h * fifth / math.sqrt(2.0 * (fifth + 0.01 * third) + 1e-200)"]
+    body += [
+        f"{lane(_END_ROW + 4)} = h * fifth / math.sqrt(2.0 * (fifth + 0.01 * third) + 1e-200)",
+        f"{lane(_END_ROW + 5)} = a1",
+    ]
     loop = ["for j in range(n):", *(f"    {line}" for line in body)]
     return "def column_steps(linear, lanes, n, h):\n" + "".join(f"    {line}\n" for line in (*linear, *loop))
 
@@ -172,8 +184,11 @@ def _end_of(work, row, j):
 
 @compiled
 def carry_in_slip(plant, mode, state, drive, duration, tangents, directions, work, known, stages):
-    """Carry tangents along a slip of this length, in which nothing happens; return whether that could be done, and
-    where it ends. If ``known`` is 1, ``stages`` are those of the step over all of it."""
+    """Carry tangents along a slip of this length, in which nothing happens.
+
+    Return whether that could be done, the least v_rel, in size, where it has a minimum in between (infinity without
+    one), and where the slip ends. If ``known`` is 1, ``stages`` are those of the step over all of it.
+    """
     plant = select_field_in_slip(plant, mode, state, drive)
     longest = plant.excitation.shortened(1.0, MAX_SLIP_STEP)
     layer = plant.friction.layer_width(mode)
@@ -182,9 +197,13 @@ def carry_in_slip(plant, mode, state, drive, duration, tangents, directions, wor
     t = 0.0
     h = longest
     trials = SLIP_TRIALS
+    nearest = math.inf
     while t < duration:
         remaining = duration - t
         h = min(h, remaining)
+        trials -= 1.0
+        if trials + SLIP_TRIAL_RATE * t < 0.0:
+            return False, nearest, x, v
         now = at_time(plant, t)
         here = drive_at(drive, t)
         if known != 1.0:
@@ -195,21 +214,27 @@ def carry_in_slip(plant, mode, state, drive, duration, tangents, directions, wor
         if directions is not None:
             sources_of(now, mode, stages, here, h, directions, n - len(directions), work)
         step_tangents(tangents, h, work)
-        noise = roundoff_floor(now, mode, x, v, here.v_belt) / max(1.0, abs(x), abs(v))
-        allowed = h * max(TANGENT_TOLERANCE, noise)
-        excess = step.error / (allowed * max(1.0, abs(x), abs(v), STIFF * abs(step.a)))
+        # The motion's own steps, so that tangents are the derivative of what was computed; shorter where a law bends.
+        allowed = TOLERANCE * h * max(1.0, abs(x), abs(v), STIFF * abs(step.a))
+        noise = h * roundoff_floor(now, mode, x, v, here.v_belt)
+        accepted = step.error <= max(allowed, noise)
         for j in range(n):
-            size = max(1.0, abs(tangents[TANGENT_X, j]), abs(tangents[TANGENT_V, j]))
-            excess = max(excess, _end_of(work, 4, j) / (allowed * size))
+            dx, dv, rate = tangents[TANGENT_X, j], tangents[TANGENT_V, j], _end_of(work, 5, j)
+            size = max(1.0, abs(dx), abs(dv), STIFF * abs(rate))
+            accepted = accepted and _end_of(work, 4, j) <= max(TANGENT_TOLERANCE * h, noise) * size
         gap = mode * (v - here.v_belt)
         gap_end = mode * (step.v - here.v_belt - here.a_belt * h)
         slope, slope_end = mode * (step.a - here.a_belt), mode * (step.a_end - here.a_belt)
-        if not excess <= 1.0 or leaps_over_layer(layer, gap, gap_end, slope, slope_end, h):
+        if not accepted or leaps_over_layer(layer, gap, gap_end, slope, slope_end, h):
             h = 0.5 * h
-            trials -= 1.0
-            if h < MIN_SLIP_STEP or trials < 0.0:
-                return False, x, v
+            if h < MIN_SLIP_STEP:
+                return False, nearest, x, v
             continue
+        if V_REL_ZERO < gap < h * (slope_end - slope) and slope < 0.0 < slope_end:
+            # It nears the belt and leaves it again.
+            to_belt = Surface(float(mode), here.v_belt, here.a_belt, False)
+            bottom = find_double_crossing(now, mode, State(x, v), here, h, to_belt, slope, slope_end)[1]
+            nearest = min(nearest, abs(look_at(now, mode, State(x, v), here, bottom, to_belt).gap))
         x, v = step.x, step.v
         for j in range(n):
             tangents[TANGENT_X, j] = _end_of(work, 0, j)
@@ -218,9 +243,9 @@ def carry_in_slip(plant, mode, state, drive, duration, tangents, directions, wor
             tangents[TANGENT_V2, j] += _end_of(work, 2, j)
             tangents[TANGENT_FV, j] += _end_of(work, 3, j)
         t = duration if h == remaining else t + h
-        if excess < STEP_DOUBLING:
+        if step.error < max(STEP_DOUBLING * allowed, noise):
             h = min(2.0 * h, longest)
-    return True, x, v
+    return True, nearest, x, v
 
 
 @compiled

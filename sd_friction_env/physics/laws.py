@@ -18,6 +18,7 @@ from scipy.interpolate import PchipInterpolator
 
 from sd_friction_env.kernel import (
     FRICTION,
+    OPTIONAL,
     SPRING,
     Asymmetric,
     Coulomb,
@@ -27,6 +28,8 @@ from sd_friction_env.kernel import (
     Stribeck,
     Tabulated,
     friction_law,
+    leaf_names,
+    leaves_of,
     spring_law,
 )
 
@@ -183,7 +186,8 @@ def _checked(
 def check_friction_law(law: Any) -> None:
     """Check that a friction law is finite, at v_rel = 0 no stronger in slip than in stick, and has right derivatives.
 
-    Derivatives are compared with finite differences, in both modes, at speeds from 0.01 to 5.
+    Derivatives, by v_rel and those by the law's numbers that it offers, are compared with finite differences, in both
+    modes, at speeds from 0.01 to 5.
 
     Raises:
         ValueError: names the law, the method, the place, the value and what it should be.
@@ -192,11 +196,15 @@ def check_friction_law(law: Any) -> None:
     for mode in (-1, 1):
         for speed in _SPEEDS:
             _check_chain(law, _FRICTION_CHAIN, functools.partial(_friction_value, law, mode), mode * speed)
+            _check_gradient(law, "coefficient_gradient", "coefficient", mode, mode * speed)
+        _check_gradient(law, "breakaway_gradient", "breakaway_coefficient", mode)
 
 
 @functools.lru_cache(maxsize=1024)
 def check_spring_law(law: Any) -> None:
     """Check that a spring is finite and has right derivatives, by finite differences at |x| <= 2.
+
+    They are those by x, those by the spring's numbers that it offers, and that of N by the weight.
 
     Raises:
         ValueError: names the law, the method, the place, the value and what it should be.
@@ -205,6 +213,58 @@ def check_spring_law(law: Any) -> None:
     for place in _PLACES:
         for chain in _SPRING_CHAINS:
             _check_chain(law, chain, functools.partial(_spring_value, law), place)
+        _check_gradient(law, "restoring_gradient", "restoring_force", place)
+        _check_gradient(law, "normal_gradient", "normal_force", 1.0, place)
+        by_weight = 0.5 * (law.normal_force(2.0, place) - law.normal_force(0.0, place))
+        if not math.isclose(law.normal_weight_slope(place), by_weight, rel_tol=_RELATIVE_ERROR, abs_tol=1e-7):
+            raise ValueError(
+                f"{_name(law)}.normal_weight_slope must be dN/d(weight): at {place:.6g} it is "
+                f"{law.normal_weight_slope(place):.9g}, a difference gives {by_weight:.9g}"
+            )
+
+
+def _check_gradient(law: Any, gradient: str, method: str, *at: float) -> None:
+    """Check the derivatives of a method by the numbers of a law, if the law offers them."""
+    if getattr(type(law), gradient) is OPTIONAL[gradient]:
+        return
+    found, names = getattr(law, gradient)(*at), leaf_names(law)
+    if not isinstance(found, tuple) or len(found) != len(names):
+        raise ValueError(f"{_name(law)}.{gradient} must be a tuple, a derivative by each of {names}, got {found!r}")
+    for i, (name, value) in enumerate(zip(names, found, strict=True)):
+        h = 1e-5 * max(1e-2, abs(leaves_of(law)[i]))
+        up, down = (getattr(_moved(law, i, by), method)(*at) for by in (h, -h))
+        difference = (up - down) / (2.0 * h)
+        if not math.isclose(value, difference, rel_tol=_RELATIVE_ERROR, abs_tol=1e-6 * (1.0 + abs(up))):
+            raise ValueError(
+                f"{_name(law)}.{gradient} must be the derivatives of {method}: by {name} at {at} it is {value:.9g}, a "
+                f"difference gives {difference:.9g}"
+            )
+
+
+def missing_gradient(law: Any) -> str | None:
+    """Return what a law, or one in it, lacks for derivatives by its numbers, in words, or None."""
+    for part in law:
+        if isinstance(part, tuple) and (lacks := missing_gradient(part)):
+            return lacks
+    methods = ["coefficient_gradient", "breakaway_gradient"]
+    if hasattr(law, "restoring_force"):
+        methods = ["restoring_gradient"]
+        if type(law).normal_force is not OPTIONAL["normal_force"]:
+            methods.append("normal_gradient")
+    lacking = [name for name in methods if getattr(type(law), name) is OPTIONAL[name]]
+    return f"the law {_name(law)} has no method {lacking[0]}" if lacking and leaf_names(law) else None
+
+
+def _moved(law: Any, number: int, by: float) -> Any:
+    """Return a law with one of its numbers, in the order of ``leaf_names``, greater."""
+    places = itertools.count()
+
+    def moved(part: Any) -> Any:
+        if isinstance(part, tuple):
+            return type(part)(*map(moved, part))
+        return part if isinstance(part, np.ndarray) else part + by * (next(places) == number)
+
+    return moved(law)
 
 
 def _check_stick(law: Any) -> None:

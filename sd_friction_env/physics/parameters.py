@@ -29,7 +29,7 @@ from sd_friction_env.kernel import (
     Stribeck,
     Unexcited,
 )
-from sd_friction_env.physics.laws import checked_friction_law, checked_spring_law
+from sd_friction_env.physics.laws import checked_friction_law, checked_spring_law, missing_gradient
 from sd_friction_env.physics.theory import stribeck_coefficients
 
 GEOMETRIES = ("exact", "cubic", "linear", "duffing")
@@ -372,12 +372,10 @@ class OscillatorParameters:
         changes = np.imag(np.array(kernel.leaves_of(plant, self.plant if excited is None else None))) / 1e-20
         if not changes.any():
             raise ValueError(f"the plant does not use the parameter {name!r}: {self}")
-        for part, law, method in (
-            ("geometry", self.plant.spring, "restoring_gradient"),
-            ("friction", self.plant.friction, "coefficient_gradient"),
-        ):
-            if name.startswith(f"{part}.") and getattr(type(law), method) is kernel.OPTIONAL[method]:
-                raise ValueError(f"the law {type(law).__name__} has no method {method}: no derivative by {name!r}")
+        law = getattr(self, name.partition(".")[0]) if "." in name else None
+        lacks = None if law is None else missing_gradient(law)
+        if lacks:
+            raise ValueError(f"no derivative by {name!r}: {lacks}")
         return changes
 
     def restoring_force(self, x: float) -> float:

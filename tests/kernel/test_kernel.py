@@ -95,6 +95,7 @@ def test_the_estimate_does_not_promise_more_than_a_step_keeps():
         assert max(abs(x_end - fine[0]), abs(v_end - fine[1])) <= 1e-9 * h + 2e-15
 
 
+@pytest.mark.slow
 def test_no_corner_of_what_is_accepted_defeats_the_error_rule():
     rng = np.random.default_rng(0)
     corners = {name: ends for name, ends in RANGES.items() if not name.endswith(("scale", "linear_stiffness"))}

@@ -30,6 +30,9 @@ HELD = {
 }
 
 
+COMPILES_MUCH = ("steps", "batches", "interpreted", "multipliers")
+
+
 def failure_of(trial, *arguments):
     """Return the kind of failure that a trial raises."""
     with pytest.raises(Failure) as found:
@@ -37,7 +40,9 @@ def failure_of(trial, *arguments):
     return script.kind_of(str(found.value))
 
 
-@pytest.mark.parametrize("name", HELD)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in COMPILES_MUCH else []) for name in HELD]
+)
 def test_what_is_right_holds(name):
     check = script.CHECKS[name]
     check.prepare()

@@ -10,7 +10,7 @@ import itertools
 import math
 import statistics
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
 import numba
@@ -21,6 +21,7 @@ from scipy.special import mathieu_a, mathieu_b
 from sd_friction_env import (
     OrbitError,
     OscillatorParameters,
+    SDFrictionVectorEnv,
     Task,
     critical_belt_speeds,
     kernel,
@@ -195,13 +196,13 @@ def differences(motion: Motion, names: list[str], column: int, stuck: bool) -> t
     return best, spread if math.isfinite(spread) else math.nan
 
 
-def accuracy(motions: int, seed: int = 0) -> None:
+def accuracy(options: argparse.Namespace) -> None:
     """Compare the derivatives of random motions with differences of the exact step."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     errors: dict[str, list[float]] = {}
     events: list[int] = []
     unclear, columns, flagged, lost = 0, 0, 0, 0
-    while len(events) < motions:
+    while len(events) < options.motions:
         motion = random_motion(rng)
         names = names_of(motion)
         end, exact = jacobian_of(motion, names)
@@ -237,7 +238,7 @@ def accuracy(motions: int, seed: int = 0) -> None:
         print(f"  {law:12} {len(own):5} motions  median {middle:.1e}  worst {worst:.1e}  over 1e-9: {over}")
 
 
-def multipliers() -> None:
+def multipliers(_: argparse.Namespace) -> None:
     """Compare Floquet multipliers with closed forms."""
     print("multipliers, largest error")
     # Without friction and damping: exp(+- i T), modulus 1.
@@ -246,7 +247,7 @@ def multipliers() -> None:
         p = OscillatorParameters(
             geometry="linear", mu_s=0.0, mu_m=0.0, beta=0.0, force_amplitude=0.3, force_frequency=rate
         )
-        found = sorted(tangent_map(p, 1.0, 0.2)[1], key=np.imag)
+        found = np.array(sorted(np.linalg.eigvals(tangent_map(p, 1.0, 0.2)), key=np.imag))
         exact = np.exp(np.array([-1j, 1j]) * 2.0 * math.pi / rate)
         worst = max(worst, float(np.abs(found - np.array(sorted(exact, key=np.imag))).max()))
     print(f"  linear, undamped (exp(+-iT)): {worst:.1e}")
@@ -266,8 +267,8 @@ def multipliers() -> None:
                 stiffness_amplitude=2.0 * q / a,
                 stiffness_frequency=2.0 / math.sqrt(a),
             )
-            found = tangent_map(p, 1.0, 0.2)[0]
-            worst = max(worst, abs(abs(float(np.trace(found))) - 2.0))
+            trace = float(np.trace(tangent_map(p, 1.0, 0.2)))
+            worst = max(worst, abs(abs(trace) - 2.0))
     print(f"  edges of Mathieu's tongues (trace 2, -2), {edges} of them: {worst:.1e}")
     # Coulomb friction on a standing floor, symmetric motion: det = exp(-2 beta T) and the ratios at the two reversals.
     worst = 0.0
@@ -296,27 +297,29 @@ def multipliers() -> None:
         v_b0, v_b1 = critical_belt_speeds(p)
         for share in (0.3, 0.6, 0.9):
             cycle = limit_cycle(p.replace(belt_speed=v_b0 + share * (v_b1 - v_b0)))
-            found = tangent_map(cycle.parameters, cycle.x_phase0, cycle.v_phase0, cycle.period)[0]
+            determinant = float(
+                np.linalg.det(tangent_map(cycle.parameters, cycle.x_phase0, cycle.v_phase0, cycle.period))
+            )
             plant, speed, traps = cycle.parameters.plant, cycle.parameters.belt_speed, np.empty((0, kernel.TRAP_ROW))
             step = 1e-3 * (cycle.x_max - cycle.x_min)
             maxima = [kernel.next_maximum(plant, speed, cycle.x_max + k * step, traps).x for k in (-2, -1, 1, 2)]
             slope = (8.0 * (maxima[2] - maxima[1]) - (maxima[3] - maxima[0])) / (12.0 * step)
             if math.isfinite(slope):
-                worst, cycles = max(worst, abs(float(np.linalg.det(found)) - slope)), cycles + 1
+                worst, cycles = max(worst, abs(determinant - slope)), cycles + 1
     print(f"  pure slip, against the slope of the return map (fourth-order differences), {cycles} cycles: {worst:.1e}")
 
 
-def tangent_map(p: OscillatorParameters, x: float, v: float, duration: float | None = None) -> tuple[Array, Array]:
-    """Return the tangent map over a period of the excitation, (2, 2), and its eigenvalues."""
+def tangent_map(p: OscillatorParameters, x: float, v: float, duration: float | None = None) -> Array:
+    """Return the tangent map over a period of the excitation, or over a duration, (2, 2)."""
     tangents = np.zeros((kernel.TANGENT_ROWS, 2))
     tangents[kernel.TANGENT_X, 0] = tangents[kernel.TANGENT_V, 1] = 1.0
     duration = drive_period(p) if duration is None else duration
     state, belt = kernel.State(x, v), kernel.steady(p.belt_speed)
     kernel.advance_with_tangents(p.excited_plant(0.0), kernel.UNKNOWN, state, belt, duration, tangents, None)
-    return tangents[:2], np.linalg.eigvals(tangents[:2])
+    return tangents[:2]
 
 
-def exponents() -> None:
+def exponents(_: argparse.Namespace) -> None:
     """Compare the sum of both exponents with the mean divergence and the determinants of the saltations."""
     worst, counted = 0.0, 0
     for friction, excitation in itertools.product(("stribeck", "hyperbolic", "coulomb"), ("force", "ripple")):
@@ -365,10 +368,10 @@ def mean_divergence(p: OscillatorParameters, motion: Any) -> float:
                 kernel.slip_acceleration(then, side, kernel.State(x_belt, p.belt_speed), belt) for side in (mode, -mode)
             )
             total += math.log(abs(after / a))
-    return total / times[-1]
+    return float(total / times[-1])
 
 
-def cost() -> None:
+def cost(_: argparse.Namespace) -> None:
     """Measure what derivatives by state and action cost, in one interleaved run."""
     rng, n = np.random.default_rng(0), 8192
     p = OscillatorParameters()
@@ -384,7 +387,7 @@ def cost() -> None:
         for _ in range(100):
             actions = rng.uniform(-1.0, 1.0, (n, 1)).astype(np.float32)
             env.step(actions)
-        states = env.get_states()
+        states = cast(SDFrictionVectorEnv, env).get_states()
         starts = np.array(
             [[s.x, s.v, s.v_belt, action] for s, action in zip(states, rng.uniform(-1.0, 1.0, n), strict=True)]
         )
@@ -443,7 +446,7 @@ def plain_return(plant: Any, actuator: Any, x: float, v: float, v_belt: float, a
     return total
 
 
-def gradient() -> None:
+def gradient(_: argparse.Namespace) -> None:
     """Measure the gradient of a 500-step return in its actions against the plain compiled rollout."""
     p, rng = OscillatorParameters(), np.random.default_rng(0)
     for task in (Task(), Task(actuator="belt_speed")):
@@ -485,7 +488,7 @@ def main() -> None:
     options = parser.parse_args()
     for name, part in PARTS.items():
         if options.only in (None, name):
-            part(options.motions) if name == "accuracy" else part()
+            part(options)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sd_friction_env import kernel
 from sd_friction_env.environments import ids
 from sd_friction_env.environments.ids import environment_id
+from sd_friction_env.environments.jacobian import step_with_jacobian
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.environments.task import Task
 from sd_friction_env.physics.parameters import OscillatorParameters
@@ -87,6 +88,18 @@ class Problem:
         for parameters, rows in self.plants.items():
             ends[rows], rewards[rows] = step_plant(self.task, parameters, states[rows], actions[rows])
         return ends, rewards
+
+    def jacobians(self, states: Array, actions: Array) -> Array:
+        """Return the derivatives of (x, v, v_belt, reward) by (x, v, v_belt, action), shape (..., 4, 4).
+
+        Args: as of :meth:`step`; where a step cannot be followed they are NaN.
+        """
+        found = np.empty((*actions.shape, 4, 4))
+        for parameters, rows in self.plants.items():
+            part = slice(None) if len(self.plants) == 1 else rows
+            step = step_with_jacobian(states[part].reshape(-1, 3), actions[part].reshape(-1), parameters, self.task)
+            found[part] = step.jacobian[:, :4].reshape(*actions[part].shape, 4, 4)
+        return found
 
     def rollout(self, actions: Array) -> tuple[Array, Array]:
         """Return the states, shape (n, steps + 1, 3), and the rewards, shape (n, steps), of action sequences.

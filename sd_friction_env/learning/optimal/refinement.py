@@ -7,7 +7,7 @@ import numpy as np
 
 from sd_friction_env.learning.optimal.problem import Array, Problem, Progress, silent
 
-_DIFFERENCE = 3e-4  # half-width of central differences: the step is exact to about 1e-11
+_DIFFERENCE = 1e-4  # half-width of central differences of the exact Jacobian
 _STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01, 0.001)
 
 
@@ -27,32 +27,27 @@ class _Derivatives:
 
 
 def _derivatives(problem: Problem, states: Array, actions: Array) -> _Derivatives:
-    """Return central differences of the step around states (n, steps, 3) and actions (n, steps)."""
-    size = problem.dimensions
-    d = size + 1
-    h = _DIFFERENCE
+    """Return the exact derivatives of the step along states (n, steps, 3) and actions (n, steps).
 
-    def at(*moves: tuple[int, float]) -> Array:
-        """Return next state and cost, shape (n, steps, d), with some of the variables moved."""
-        moved, moved_actions = states.copy(), actions.copy()
-        for i, by in moves:
-            if i < size:
-                moved[..., i] += by
-            else:
-                moved_actions += by
-        ends, rewards = problem.step(moved, moved_actions)
-        return np.concatenate([ends[..., :size], -rewards[..., None]], axis=-1)
+    The second ones are central differences of the first.
+    """
+    size, h = problem.dimensions, _DIFFERENCE
+    rows, columns = [*range(size), -1], [*range(size), -1]  # the reward and the action are the last
 
-    middle = at()
-    up = [at((i, h)) for i in range(d)]
-    down = [at((i, -h)) for i in range(d)]
-    first = np.stack([(up[i] - down[i]) / (2.0 * h) for i in range(d)], axis=-1)
-    second = np.empty((*first.shape, d))
-    for i in range(d):
-        second[..., i, i] = (up[i] - 2.0 * middle + down[i]) / (h * h)
-        for j in range(i):
-            both = at((i, h), (j, h)) + at((i, -h), (j, -h)) - up[i] - down[i] - up[j] - down[j] + 2.0 * middle
-            second[..., i, j] = second[..., j, i] = both / (2.0 * h * h)
+    def at(moved: int, by: float) -> Array:
+        """Return the Jacobian of next state and cost, shape (n, steps, d, d), with one of the variables moved."""
+        actions_there, states_there = actions, states.copy()
+        if moved < size:
+            states_there[..., moved] += by
+        else:
+            actions_there = np.clip(actions, -1.0 + h, 1.0 - h) + by
+        found = problem.jacobians(states_there, actions_there)[..., rows, :][..., columns]
+        found[..., -1, :] *= -1.0
+        return np.nan_to_num(found)
+
+    first = at(0, 0.0)
+    second = np.stack([(at(i, h) - at(i, -h)) / (2.0 * h) for i in range(size + 1)], axis=-1)
+    second = 0.5 * (second + np.swapaxes(second, -1, -2))
     return _Derivatives(first[:, :, :size], second[:, :, :size], first[:, :, size], second[:, :, size])
 
 

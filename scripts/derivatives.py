@@ -238,7 +238,7 @@ def accuracy(options: argparse.Namespace) -> None:
         print(f"  {law:12} {len(own):5} motions  median {middle:.1e}  worst {worst:.1e}  over 1e-9: {over}")
 
 
-def multipliers(_: argparse.Namespace) -> None:
+def multipliers(_options: argparse.Namespace) -> None:
     """Compare Floquet multipliers with closed forms."""
     print("multipliers, largest error")
     # Without friction and damping: exp(+- i T), modulus 1.
@@ -319,7 +319,7 @@ def tangent_map(p: OscillatorParameters, x: float, v: float, duration: float | N
     return tangents[:2]
 
 
-def exponents(_: argparse.Namespace) -> None:
+def exponents(_options: argparse.Namespace) -> None:
     """Compare the sum of both exponents with the mean divergence and the determinants of the saltations."""
     worst, counted = 0.0, 0
     for friction, excitation in itertools.product(("stribeck", "hyperbolic", "coulomb"), ("force", "ripple")):
@@ -371,7 +371,7 @@ def mean_divergence(p: OscillatorParameters, motion: Any) -> float:
     return float(total / times[-1])
 
 
-def cost(_: argparse.Namespace) -> None:
+def cost(_options: argparse.Namespace) -> None:
     """Measure what derivatives by state and action cost, in one interleaved run."""
     rng, n = np.random.default_rng(0), 8192
     p = OscillatorParameters()
@@ -446,7 +446,7 @@ def plain_return(plant: Any, actuator: Any, x: float, v: float, v_belt: float, a
     return total
 
 
-def gradient(_: argparse.Namespace) -> None:
+def gradient(_options: argparse.Namespace) -> None:
     """Measure the gradient of a 500-step return in its actions against the plain compiled rollout."""
     p, rng = OscillatorParameters(), np.random.default_rng(0)
     for task in (Task(), Task(actuator="belt_speed")):

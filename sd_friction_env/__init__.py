@@ -16,6 +16,8 @@ if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out f
     from sd_friction_env.control.pretrained import load_pretrained
     from sd_friction_env.environments.batch import SDFrictionVectorEnv
     from sd_friction_env.environments.callbacks import AnnealedExploration
+    from sd_friction_env.environments.differentiable import jax_step, torch_step
+    from sd_friction_env.environments.jacobian import StepJacobian, return_with_gradient, step_with_jacobian
     from sd_friction_env.environments.sb3 import SDFrictionVecEnv
     from sd_friction_env.environments.single import SDFrictionEnv
     from sd_friction_env.environments.states import EnvState
@@ -60,6 +62,11 @@ _PUBLIC = {
     "load_pretrained": "control.pretrained",
     "SDFrictionVectorEnv": "environments.batch",
     "AnnealedExploration": "environments.callbacks",
+    "jax_step": "environments.differentiable",
+    "torch_step": "environments.differentiable",
+    "StepJacobian": "environments.jacobian",
+    "return_with_gradient": "environments.jacobian",
+    "step_with_jacobian": "environments.jacobian",
     "SDFrictionVecEnv": "environments.sb3",
     "EnvState": "environments.states",
     "SDFrictionEnv": "environments.single",
@@ -117,6 +124,7 @@ __all__ = [
     "SDFrictionVecEnv",
     "SDFrictionVectorEnv",
     "ScaledReward",
+    "StepJacobian",
     "Table",
     "Task",
     "Trajectory",
@@ -133,19 +141,23 @@ __all__ = [
     "forced",
     "friction_law",
     "friction_table",
+    "jax_step",
     "limit_cycle",
     "load_policy",
     "load_pretrained",
     "plotting",
     "policies",
     "read_rig",
+    "return_with_gradient",
     "simulate",
     "slip_cycles",
     "spring_law",
+    "step_with_jacobian",
     "stick_intervals",
     "sweeps",
     "tabulated_friction",
     "theory",
+    "torch_step",
 ]
 
 for _id, _arguments in ARGUMENTS.items():

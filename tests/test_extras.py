@@ -40,6 +40,8 @@ except ImportError as error:
         ("stable_baselines3", "from sd_friction_env import SDFrictionVecEnv", "train"),
         ("torch,stable_baselines3", "from sd_friction_env import AnnealedExploration", "train"),
         ("stable_baselines3", "import sd_friction_env.environments.sb3", "train"),
+        ("torch", "from sd_friction_env import torch_step; torch_step()", "torch"),
+        ("jax", "from sd_friction_env import jax_step; jax_step()", "jax"),
         (
             "sb3_contrib",
             "from sd_friction_env.cli.main import main; main(['train', '--task', 'force', '--algo', 'ppo'])",

@@ -34,6 +34,8 @@ _FEATURES = {
     "sweep": "sweeps in several processes",
     "dask": "sweeps on a Dask cluster",
     "ray": "sweeps on a Ray cluster",
+    "torch": "the differentiable step in PyTorch",
+    "jax": "the differentiable step in JAX",
     "completion": "completion in the shell",
 }
 

@@ -1,6 +1,5 @@
 """A control step, and the return of an action sequence, with exact derivatives through stick and slip."""
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -114,13 +113,13 @@ def step_with_jacobian(
         TypeError, ValueError: if a value is not finite, an action is out of range, shapes differ, or the plant does not
             use a parameter, or its law offers no derivatives by its numbers.
     """
-    starts, shape = _starts(state, action)
+    starts, shape = starts_of(state, action)
     directions, changes = parameter_directions(parameters, by)
     n, rows = starts.shape[1], kernel.OUTCOMES
     outcomes = np.empty((n, len(rows)))
     jacobian = np.empty((n, len(rows), len(kernel.CAUSES) + len(changes)))
     codes = np.empty((2, n), np.int64)
-    plant = _plant_at(parameters, time)
+    plant = plant_at(parameters, time)
     actuator = task.actuator_of(parameters)
     kernel.control_intervals_with_tangents(plant, actuator, starts, directions, changes, outcomes, jacobian, codes)
     pick = slice(None) if shape else 0
@@ -156,16 +155,18 @@ def return_with_gradient(
         TypeError, ValueError: as :func:`step_with_jacobian`.
         RuntimeError: if the mass loses contact with the belt, or the motion cannot be followed.
     """
-    sequence = np.asarray(actions, np.float64)
+    sequence = np.asarray(actions)
     if sequence.ndim != 1 or not sequence.size:
         raise ValueError(f"actions must have shape (steps,) with steps >= 1, got {sequence.shape}")
-    starts, _ = _starts(np.broadcast_to(np.asarray(state, np.float64), (sequence.size, 3)), sequence)
+    if np.shape(state) != (3,):
+        raise ValueError(f"state must have shape (3,), got {np.shape(state)}")
+    starts, _ = starts_of(np.broadcast_to(state, (sequence.size, 3)), sequence)
     directions, changes = parameter_directions(parameters, by)
     by_actions, by_start = np.empty(sequence.size), np.empty(3 + len(changes))
     x, v, v_belt = starts[:3, 0].tolist()
     start, held = kernel.State(x, v), np.ascontiguousarray(starts[3])
     total, status, worst = kernel.return_with_gradient(
-        _plant_at(parameters, 0.0),
+        plant_at(parameters, 0.0),
         task.actuator_of(parameters),
         start,
         v_belt,
@@ -196,17 +197,25 @@ def parameter_directions(parameters: OscillatorParameters, by: Sequence[str]) ->
     return np.array(changes), np.array([float(name == "belt_speed") for name in by])
 
 
-def _plant_at(parameters: OscillatorParameters, time: float) -> kernel.Plant:
-    if not parameters.excited:
-        return parameters.plant
-    plant: kernel.Plant = kernel.at_time(parameters.plant, checked_number("time", time, 0.0, 1e9))
+def plant_at(parameters: OscillatorParameters, time: float) -> kernel.Plant:
+    """Return the plant at a time in [0, 1e9].
+
+    Raises:
+        TypeError, ValueError: if it is not such a number.
+    """
+    time = checked_number("time", time, 0.0, 1e9)
+    plant: kernel.Plant = kernel.at_time(parameters.plant, time) if parameters.excited else parameters.plant
     return plant
 
 
-def _starts(state: ArrayLike, action: ArrayLike) -> tuple[FloatArray, tuple[int, ...]]:
-    """Return x, v, v_belt and action as rows of an array, (4, n), and the shape of the action."""
+def starts_of(state: ArrayLike, action: ArrayLike) -> tuple[FloatArray, tuple[int, ...]]:
+    """Return x, v, v_belt and action as rows of a new array, (4, n), and the shape of the action.
+
+    Raises:
+        TypeError, ValueError: if one is not a number, not finite, or out of range, or shapes differ.
+    """
     try:
-        states, actions = np.asarray(state, np.float64), np.asarray(action, np.float64)
+        states, actions = (np.asarray(given).astype(np.float64, casting="same_kind") for given in (state, action))
     except (TypeError, ValueError):
         raise TypeError(f"state and action must be numbers, got {state!r} and {action!r}") from None
     shape = actions.shape
@@ -216,11 +225,10 @@ def _starts(state: ArrayLike, action: ArrayLike) -> tuple[FloatArray, tuple[int,
         )
     starts = np.empty((4, actions.size))
     starts[:3], starts[3] = states.T.reshape(3, -1), actions
-    if not math.isfinite(starts.sum()):
-        bad = np.argwhere(~np.isfinite(starts))
-        if bad.size:
-            which, i = bad[0].tolist()
-            raise ValueError(f"{kernel.CAUSES[which]} must be finite, got {starts[which, i].item()!r} at state {i}")
+    finite = np.isfinite(starts)
+    if not finite.all():
+        which, i = np.argwhere(~finite)[0].tolist()
+        raise ValueError(f"{kernel.CAUSES[which]} must be finite, got {starts[which, i].item()!r} at state {i}")
     if not np.abs(starts[3]).max(initial=0.0) <= 1.0:
         raise ValueError(f"action must be in [-1, 1], got {starts[3][np.abs(starts[3]) > 1.0][0].item()!r}")
     return starts, shape

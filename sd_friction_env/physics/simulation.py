@@ -267,8 +267,12 @@ class _Rates:
     """The tangents of a simulation in progress, in named directions."""
 
     def __init__(self, parameters: OscillatorParameters, names: Sequence[str], *, rides: bool) -> None:
-        if isinstance(names, str) or len(set(names)) < len(names):
-            raise ValueError(f"sensitivities must be different names, got {names!r}")
+        try:
+            different = not isinstance(names, str) and len(set(names)) == len(names)
+        except TypeError:
+            different = False
+        if not different:
+            raise ValueError(f"sensitivities must be different names, got {brief_repr(names)}")
         starts = {"x": kernel.TANGENT_X, "v": kernel.TANGENT_V, "force": kernel.TANGENT_U}
         starts |= {"belt_speed": kernel.TANGENT_BELT, "belt_acceleration": kernel.TANGENT_A_BELT}
         self.names = tuple(names)

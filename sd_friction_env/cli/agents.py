@@ -5,7 +5,14 @@ from typing import Any
 
 from sd_friction_env import ENVIRONMENT_IDS, load_pretrained
 from sd_friction_env.cli.options import UsageError
-from sd_friction_env.control.policies import NetworkPolicy, Policy, VelocityFeedback, ZeroPolicy, load_policy
+from sd_friction_env.control.policies import (
+    NetworkPolicy,
+    Policy,
+    VelocityFeedback,
+    ZeroPolicy,
+    load_policy,
+    threshold_follower,
+)
 from sd_friction_env.learning import evaluation, runs
 
 # On force near the best there is. On belt the belt follows the mass, which makes matters worse at any gain.
@@ -50,7 +57,8 @@ def velocity_feedback(env_id: str, env_kwargs: dict[str, Any], gain: float | Non
 
 
 def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
-    """Return the controller that --agent names: pretrained, passive, velocity-feedback, a run folder or a .npz file.
+    """Return the controller that --agent names: pretrained, passive, velocity-feedback, threshold-follower, a run
+    folder or a .npz file.
 
     Raises:
         ValueError: if there is no such agent, or it does not fit the environment.
@@ -63,10 +71,13 @@ def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
         return ZeroPolicy()
     if name == "velocity-feedback":
         return velocity_feedback(env_id, {}, gain)[0]
+    if name == "threshold-follower":
+        return threshold_follower(evaluation.make_env(env_id))
     path = Path(name)
     if path.suffix.lower() != ".npz" and not path.is_dir():
         raise UsageError(
-            f"--agent must be pretrained, velocity-feedback, passive, a run folder or a policy's .npz, got {name!r}"
+            "--agent must be pretrained, velocity-feedback, threshold-follower, passive, a run folder or a policy's "
+            f".npz, got {name!r}"
         )
     policy, _ = stored_agent(path)
     check_fit(path, policy, env_id, {})
@@ -75,6 +86,10 @@ def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
 
 def title_of(name: str, policy: Policy) -> str:
     """Return what a picture calls the controller that --agent names."""
-    titles = {"passive": "no control", "velocity-feedback": "velocity feedback"}
+    titles = {
+        "passive": "no control",
+        "velocity-feedback": "velocity feedback",
+        "threshold-follower": "threshold follower",
+    }
     algorithm = str(getattr(policy, "metadata", {}).get("algorithm", "trained"))
     return titles.get(name, f"{algorithm.upper()} agent")

@@ -25,10 +25,10 @@ from sd_friction_env.cli.options import (
     named_environment,
     numbers,
 )
-from sd_friction_env.control.policies import ConstantPolicy, Policy, ZeroPolicy
+from sd_friction_env.control.policies import ConstantPolicy, Policy, ZeroPolicy, threshold_follower
 from sd_friction_env.learning import classical, evaluation, grids
 
-CONTROLLERS = ("passive", "velocity-feedback", "constant", "classical")
+CONTROLLERS = ("passive", "velocity-feedback", "threshold-follower", "constant", "classical")
 
 TEXT = """\
 Passive always comes first. score: 0 passive, 1 the optimum where one is stored ("-" where none is), over the episodes
@@ -77,6 +77,8 @@ def _controllers(
         elif name == "velocity-feedback":
             policy, used = velocity_feedback(env_id, env_kwargs, gain)
             made[f"velocity feedback {used:g}"] = policy
+        elif name == "threshold-follower":
+            made["threshold follower"] = threshold_follower(evaluation.make_env(env_id, env_kwargs))
     return made
 
 
@@ -147,7 +149,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _add_grid(parser: argparse.ArgumentParser) -> None:
     add_environment(parser, arguments=False)
-    text = "pretrained (default), velocity-feedback, passive, a run folder, or a policy's .npz"
+    text = "pretrained (default), velocity-feedback, threshold-follower, passive, a run folder, or a policy's .npz"
     parser.add_argument("--agent", default="pretrained", help=text)
     text = "a parameter of the plant with its values or ranges from:to:step; several make a grid"
     parser.add_argument("--over", nargs="+", action="append", required=True, metavar=("NAME", "VALUE"), help=text)

@@ -115,7 +115,7 @@ def _tune(options: argparse.Namespace) -> int:
 def _add_classical(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", nargs="+", choices=TASKS, default=list(TASKS), help="actuators (default: both)")
     parser.add_argument("--tier", nargs="+", choices=TIERS, default=list(TIERS), help="default: all")
-    parser.add_argument("--controller", nargs="+", choices=classical.KINDS, help="default: all that the sensor allows")
+    parser.add_argument("--controller", nargs="+", choices=classical.KINDS, help="default: all that fit")
     parser.add_argument("--seed", type=int, default=0, help="of the search (default: 0)")
     parser.add_argument("--generations", type=int, default=50, metavar="N", help="of the search (default: 50)")
     parser.add_argument("--population", type=int, default=12, metavar="N", help="per tuned value (default: 12)")
@@ -133,7 +133,8 @@ def _classical(options: argparse.Namespace) -> int:
             allowed = classical.kinds_for(env_id)
             jobs += [(env_id, name) for name in options.controller or allowed if name in allowed]
     if not jobs:
-        raise UsageError(f"--controller {', '.join(options.controller)} lacks a measurement in --tier {options.tier}")
+        names, where = ", ".join(options.controller), f"--task {' '.join(options.task)} --tier {' '.join(options.tier)}"
+        raise UsageError(f"--controller {names} is not for the actuator or the sensor of {where}")
     for env_id, name in jobs:
         with tqdm(total=100, desc=f"{env_id}: {name}", unit="%", dynamic_ncols=True, leave=False) as bar:
 

@@ -20,7 +20,14 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sd_friction_env.control.policies import ConstantPolicy, Policy, State, VelocityFeedback, ZeroPolicy
+from sd_friction_env.control.policies import (
+    ConstantPolicy,
+    EstimatingFollower,
+    Policy,
+    State,
+    VelocityFeedback,
+    ZeroPolicy,
+)
 from sd_friction_env.control.pretrained import load_pretrained
 from sd_friction_env.environments.ids import environment_id
 from sd_friction_env.environments.single import SDFrictionEnv
@@ -30,7 +37,8 @@ from sd_friction_env.physics.orbits import LimitCycle, OrbitError, limit_cycle
 from sd_friction_env.physics.parameters import STATE_LIMIT, Kind, OscillatorParameters
 from sd_friction_env.pictures.plotting import BLACK, BLUE, GREEN, GREY, VERMILION
 
-OFF, FEEDBACK, AGENT, ROBUST, HAND = "off", "velocity feedback", "trained agent", "trained agent, robust", "by hand"
+OFF, FEEDBACK, FOLLOWER, HAND = "off", "velocity feedback", "threshold follower", "by hand"
+AGENT, ROBUST = "trained agent", "trained agent, robust"
 PLUGINS = "sd_friction_env.controllers"  # group of entry points: functions from an environment's id to a policy
 BASIN_VIEW = ((-1.6, 1.6), (-1.2, 1.2))  # starts in x and in v
 COMPILATION = 15  # seconds, roughly, on a quiet core
@@ -51,7 +59,7 @@ def plugins() -> importlib.metadata.EntryPoints:
 
 def controllers() -> list[str]:
     """Return the names of all controllers, plugins included."""
-    return [OFF, FEEDBACK, AGENT, ROBUST, *sorted(set(plugins().names)), HAND]
+    return [OFF, FEEDBACK, FOLLOWER, AGENT, ROBUST, *sorted(set(plugins().names)), HAND]
 
 
 class Sign(NamedTuple):
@@ -143,6 +151,8 @@ class Live:
         try:
             if controller == FEEDBACK:
                 return VelocityFeedback.from_env(gym.make(self.env_id), _GAIN)
+            if controller == FOLLOWER:
+                return EstimatingFollower.from_env(gym.make(self.env_id), waits=True)
             if controller == AGENT:
                 return load_pretrained(self.env_id)
             if controller == ROBUST:

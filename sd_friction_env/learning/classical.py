@@ -24,12 +24,15 @@ from sd_friction_env import ENVIRONMENT_IDS, SDFrictionEnv
 from sd_friction_env.control.policies import (
     Actions,
     DelayedFeedback,
+    EstimatingFollower,
     FilteredFeedback,
     LinearFeedback,
+    ObservingFollower,
     Policy,
     Readings,
     SlidingMode,
     State,
+    ThresholdFollower,
     VelocityFeedback,
 )
 from sd_friction_env.learning import evaluation
@@ -90,12 +93,19 @@ class Kind:
         ranges: of each value, by name.
         needs_velocity: whether it needs the sensor "state" (otherwise it is for the sensors that see x alone).
         everywhere: whether it is for both kinds of sensors.
+        actuator: the only one that it is for, "force" or "belt_speed"; None: both.
     """
 
     build: Callable[[SDFrictionEnv, Sequence[float]], Policy]
     ranges: Callable[[SDFrictionEnv], dict[str, Range]]
     needs_velocity: bool = True
     everywhere: bool = False
+    actuator: str | None = None
+
+    def fits(self, env: SDFrictionEnv) -> bool:
+        """Whether the controller is for an environment's sensor and actuator."""
+        sensor_fits = self.everywhere or self.needs_velocity == (env.task.sensor == "state")
+        return sensor_fits and self.actuator in (None, env.task.actuator)
 
 
 def _linear(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
@@ -127,6 +137,10 @@ def _delayed(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
 def _sliding(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
     slope, layer, amplitude = values
     return SlidingMode.from_env(env, slope=slope, layer=10.0**layer, amplitude=amplitude)
+
+
+def _follower(kind: type[ThresholdFollower], env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    return kind.from_env(env, 10.0 ** values[0], *values[1:])
 
 
 def _gain(unit: float) -> Range:
@@ -165,6 +179,13 @@ _POLE = Range(0.0, 0.99, low_is="no smoothing")
 _AMPLITUDE = Range(-1.0, 1.0, low_is="all that the actuator gives", high_is="all that the actuator gives")
 _DELAY = Range(1.0, 100.0, low_is="the shortest delay there is")
 _WEIGHT = Range(-8.0, 8.0)
+_FOLLOWS = {
+    "log10 gain": Range(-2.0, 4.0, low_is="hardly any feedback", high_is="a switch"),
+    # Of the slowest belt speed (the nominal one: 2 in the tiers). At 1, rounding decides whether the mass rides the
+    # slowest belt.
+    "threshold": Range(1.005, 4.0, low_is="just above the slowest belt speed"),
+}
+_CORRECTIONS = {"x correction": Range(0.0, 1.0, high_is="the reading itself"), "v correction": Range(0.0, 10.0)}
 KINDS: dict[str, Kind] = {
     "velocity feedback": Kind(_velocity, lambda env: {"gain": _velocity_gain(env)}),
     "linear state feedback": Kind(_linear, _linear_ranges),
@@ -183,13 +204,25 @@ KINDS: dict[str, Kind] = {
         lambda env: {"slope": _slope(env), "log10 layer": _LAYER, "pole": _POLE, "amplitude": _AMPLITUDE},
         needs_velocity=False,
     ),
+    "threshold follower": Kind(
+        functools.partial(_follower, ThresholdFollower), lambda env: _FOLLOWS, actuator="belt_speed"
+    ),
+    "threshold follower, belt speed estimated": Kind(
+        functools.partial(_follower, EstimatingFollower), lambda env: _FOLLOWS, actuator="belt_speed"
+    ),
+    "threshold follower, observer": Kind(
+        functools.partial(_follower, ObservingFollower),
+        lambda env: {**_FOLLOWS, **_CORRECTIONS},
+        needs_velocity=False,
+        actuator="belt_speed",
+    ),
 }
 
 
 def kinds_for(env_id: str) -> list[str]:
-    """Return the names of the controllers that an environment's sensor allows."""
-    sees = evaluation.make_env(env_id).task.sensor == "state"
-    return [name for name, kind in KINDS.items() if kind.everywhere or kind.needs_velocity == sees]
+    """Return the names of the controllers that are for an environment's sensor and actuator."""
+    env = evaluation.make_env(env_id)
+    return [name for name, kind in KINDS.items() if kind.fits(env)]
 
 
 # LQR ------------------------------------------------------------------------------------------------------------------

@@ -226,6 +226,7 @@ def test_a_video_shows_any_agent_that_fits(tmp_path, capsys):
     agent = str(pretrained_file("SDFriction/ForceSensed-v0"))
     assert main(["video", "--task", "force", "--tier", "sensed", "--out", out, *small]) == 0
     assert main(["video", "--task", "force", "--tier", "sensed", "--agent", agent, "--out", out, *small]) == 0
+    assert main(["video", "--task", "belt", "--agent", "threshold-follower", "--out", out, *small]) == 0
     assert main(["video", "--task", "force", "--agent", agent, "--out", out, *small]) == 2
     assert "observes 1 values, and SDFriction/Force-v0 gives 2" in capsys.readouterr().err
 
@@ -245,6 +246,7 @@ def test_a_video_shows_any_agent_that_fits(tmp_path, capsys):
         ("--task force --out film.gif --agent none.npz", "none.npz"),
         ("--task force --out film.gif --gain 2", "--gain goes with --agent velocity-feedback"),
         ("--task force --tier sensed --agent velocity-feedback --out film.gif", "sees the position only"),
+        ("--task force --agent threshold-follower --out film.gif", "needs the actuator 'belt_speed'"),
         ("--task rope --out film.gif", "invalid choice: 'rope'"),
         ("--task force", "required: --out"),
     ],

@@ -24,6 +24,7 @@ from sd_friction_env.explorer import page as page_module
 from sd_friction_env.explorer.model import (
     AGENT,
     FEEDBACK,
+    FOLLOWER,
     HAND,
     OFF,
     ROBUST,
@@ -93,7 +94,7 @@ def test_controllers_are_switched_while_it_runs_and_compared_from_there(task):
         live.choose_controller(controller)
         assert (live.loop.info["x"], live.loop.info["v"]) == before  # not moved by the switch
         assert live.steps == 0
-    assert live.missing == {}
+    assert set(live.missing) == ({FOLLOWER} if task == "force" else set())
     live.restart()
     for controller, good in (
         (OFF, False),
@@ -101,6 +102,7 @@ def test_controllers_are_switched_while_it_runs_and_compared_from_there(task):
         (ROBUST, True),
         ("optimum", True),
         (FEEDBACK, task == "force"),
+        (FOLLOWER, task == "belt"),
     ):
         live.restart()
         live.choose_controller(controller)

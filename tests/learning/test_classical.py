@@ -330,7 +330,8 @@ def test_where_there_is_no_fcntl_the_lock_is_that_of_windows(tmp_path, monkeypat
         (["--task", "rope"], "invalid choice: 'rope'"),
         (["--generations", "0"], "--generations must be at least 1, got 0"),
         (["--seed", "-1"], "--seed must be at least 0, got -1"),
-        (["--tier", "sensed", "--controller", "LQR"], "LQR"),
+        (["--tier", "sensed", "--controller", "LQR"], "LQR is not for the actuator or the sensor of --task force belt"),
+        (["--task", "force", "--controller", "threshold follower"], "threshold follower is not for the actuator"),
     ],
 )
 def test_the_script_refuses_what_cannot_be(arguments, message, capsys):

@@ -365,6 +365,7 @@ def test_the_script_refuses_bad_arguments_in_one_line(tmp_path, capsys):
         (["--task", "force", "--csv", str(tmp_path / "no" / "x.csv")], "--csv must be"),
         (["--task", "force", "--env-arg", "w_effort=-1"], "w_effort"),
         (["--task", "force", "--tier", "sensed", "--controller", "velocity-feedback"], "sees the position only"),
+        (["--task", "force", "--controller", "threshold-follower"], "needs the actuator 'belt_speed', got 'force'"),
         (
             [str(AGENTS / "best" / "SDFriction-ForceSensed-v0.npz"), "--task", "belt", "--tier", "sensed"],
             "whose actuator",

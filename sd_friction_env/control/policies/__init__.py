@@ -18,6 +18,12 @@ from sd_friction_env.control.policies.feedback import (
     SlidingMode,
     VelocityFeedback,
 )
+from sd_friction_env.control.policies.follower import (
+    EstimatingFollower,
+    ObservingFollower,
+    ThresholdFollower,
+    threshold_follower,
+)
 from sd_friction_env.control.policies.network import NetworkPolicy, PolicyFileError, load_policy
 from sd_friction_env.control.policies.policy import Actions, ConstantPolicy, Policy, State, ZeroPolicy
 
@@ -25,16 +31,20 @@ __all__ = [
     "Actions",
     "ConstantPolicy",
     "DelayedFeedback",
+    "EstimatingFollower",
     "Feedback",
     "FilteredFeedback",
     "LinearFeedback",
     "NetworkPolicy",
+    "ObservingFollower",
     "Policy",
     "PolicyFileError",
     "Readings",
     "SlidingMode",
     "State",
+    "ThresholdFollower",
     "VelocityFeedback",
     "ZeroPolicy",
     "load_policy",
+    "threshold_follower",
 ]

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env.control.policies.policy import Actions, State, checked_memory
+from sd_friction_env.control.policies.policy import Actions, State, broadcast_starts, checked_memory
 from sd_friction_env.physics.orbits import equilibria
 from sd_friction_env.physics.parameters import checked_number
 
@@ -219,7 +219,7 @@ class FilteredFeedback(Feedback):
     def _act(self, values: _Floats, state: State, starts: _Starts) -> tuple[_Floats, State]:
         x = values[..., 0]
         before, estimate = (x, np.zeros_like(x)) if state is None else checked_memory(state, x.shape, x.shape)
-        begun = _broadcast(starts, x)
+        begun = broadcast_starts(starts, x)
         before, estimate = np.where(begun, x, before), np.where(begun, 0.0, estimate)
         estimate = self.pole * estimate + (1.0 - self.pole) * (x - before) / self.control_interval
         action = np.clip(self.bias + self.x_gain * x + self.v_gain * estimate, -self.amplitude, self.amplitude)
@@ -255,7 +255,7 @@ class DelayedFeedback(Feedback):
         past = first
         if state is not None:
             (past,) = checked_memory(state, first.shape)
-            past = np.where(_broadcast(starts, x)[..., None], first, past)
+            past = np.where(broadcast_starts(starts, x)[..., None], first, past)
         action = self.gain * (past[..., 0] - x)
         return action, (np.concatenate([past[..., 1:], x[..., None]], axis=-1),)
 
@@ -282,9 +282,3 @@ class SlidingMode(Feedback):
     def _act(self, values: _Floats, state: State, starts: _Starts) -> tuple[_Floats, State]:
         surface = values[..., 1] + self.slope * values[..., 0]
         return -self.amplitude * np.clip(surface / self.layer, -1.0, 1.0), None
-
-
-def _broadcast(starts: _Starts, like: _Floats) -> NDArray[np.bool_]:
-    """Return where an episode has just begun, in the shape of ``like``."""
-    begun = np.asarray(False if starts is None else starts, dtype=bool)
-    return np.broadcast_to(begun.reshape(()) if like.ndim == 0 and begun.size == 1 else begun, like.shape)

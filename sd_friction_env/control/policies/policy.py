@@ -72,3 +72,9 @@ def checked_memory(state: tuple[NDArray[Any], ...], *shapes: tuple[int, ...]) ->
             f"{', '.join(map(str, shapes))}; got {', '.join(map(str, found)) or 'nothing'}"
         )
     return state
+
+
+def broadcast_starts(starts: ArrayLike | None, like: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return where an episode has just begun, in the shape of ``like``."""
+    begun = np.asarray(False if starts is None else starts, dtype=bool)
+    return np.broadcast_to(begun.reshape(()) if like.ndim == 0 and begun.size == 1 else begun, like.shape)

@@ -1,0 +1,222 @@
+"""A belt that follows the mass below a threshold: a rule of two numbers found from the optimum, and what to do where
+the belt's speed or the velocity is not known.
+"""
+
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sd_friction_env import kernel
+from sd_friction_env.control.policies.feedback import Feedback
+from sd_friction_env.control.policies.policy import State, broadcast_starts, checked_memory
+from sd_friction_env.physics.parameters import OscillatorParameters
+
+_Floats = NDArray[np.float64]
+
+_REPEATS = 1e-6  # of the nominal belt speed: observations are float32, and a mass that sticks has the belt's speed
+_LEAST_SHARE = 0.01  # of the estimate: slower repetitions are those of a mass at rest
+
+
+@dataclass(frozen=True)
+class ThresholdFollower(Feedback):
+    """Belt that follows the mass, unless a fast belt would catch it: for a known belt speed and an observed velocity.
+
+    action = clip(gain v/belt_speed, -1, 1) while v < threshold (1 - belt_authority) belt_speed, otherwise -1.
+
+    Friction falls with the sliding speed, so that a belt that follows the mass damps it. A belt that runs fast when the
+    mass reaches its speed carries the mass along and throws it back faster; beyond the threshold, just above the
+    slowest belt speed, the belt therefore slows down. Found from the optimum of ``sd-friction optimum``.
+
+    Attributes:
+        gain: action per v/belt_speed, in [0, 1e9].
+        threshold: in units of the slowest belt speed, in [0, 1e6].
+        belt_speed: nominal belt speed, in [1e-6, 1e9] (dimensionless, as v).
+        belt_authority: largest relative change of the belt speed, in [1e-9, 1e9].
+
+    Raises:
+        TypeError, ValueError: if a number is not as said, the actuator is not the belt's speed, or the velocity is
+            needed and not observed.
+    """
+
+    gain: float = 6.0
+    threshold: float = 1.1
+    _: KW_ONLY
+    belt_speed: float
+    belt_authority: float
+
+    _ranges: ClassVar = {
+        "gain": (0.0, 1e9),
+        "threshold": (0.0, 1e6),
+        "belt_speed": (1e-6, 1e9),
+        "belt_authority": (1e-9, 1e9),
+    }
+    _needs_velocity = True
+
+    def __post_init__(self) -> None:
+        if self.readings.actuator != "belt_speed":
+            raise ValueError(f"{type(self).__name__} needs the actuator 'belt_speed', got {self.readings.actuator!r}")
+        super().__post_init__()
+
+    @classmethod
+    def from_env(cls, env: Any, *arguments: Any, **named: Any) -> Self:
+        """Return the controller of an environment, from its nominal plant; see :meth:`Feedback.from_env`."""
+        bare = getattr(env, "unwrapped", None)
+        if hasattr(bare, "task") and hasattr(bare, "nominal"):
+            named = cls._known(bare) | named
+        return super().from_env(env, *arguments, **named)
+
+    @classmethod
+    def _known(cls, env: Any) -> dict[str, Any]:
+        """Return what the controller knows of a bare environment."""
+        return {"belt_speed": env.nominal.belt_speed, "belt_authority": env.task.belt_authority}
+
+    def _act(self, values: _Floats, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
+        return self._follow(values[..., 1], self.belt_speed), None
+
+    def _follow(self, v: _Floats, belt_speed: _Floats | float) -> _Floats:
+        """Return the actions (...), not yet clipped, at velocities (...) and nominal belt speeds (...)."""
+        follows = v < self.threshold * (1.0 - self.belt_authority) * belt_speed
+        return np.where(follows, self.gain * v / belt_speed, -1.0)
+
+
+@dataclass(frozen=True)
+class EstimatingFollower(ThresholdFollower):
+    """:class:`ThresholdFollower` that estimates the nominal belt speed from v and the belt modulation m.
+
+    The ratio v/(1 + belt_authority m) is the nominal belt speed while the mass sticks, and smaller while the belt
+    overtakes it. The estimate is the last ratio that repeated, which shows that the mass sticks. Until one repeats it
+    is the largest ratio of the episode; a start faster than the belt makes that too large, and where the mass then
+    never sticks it stays so. With sensor noise nothing repeats.
+
+    Attributes:
+        waits: whether the belt runs slow until the mass sticks, in place of following by the largest ratio: slower from
+            the passive cycle, safe from any start.
+        belt_speed: of the nominal plant; only the scale at which ratios count as equal.
+
+    Raises:
+        TypeError: if ``waits`` is not True or False.
+    """
+
+    threshold: float = 1.006
+    waits: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.waits, bool):
+            raise TypeError(f"waits must be True or False, got {self.waits!r}")
+
+    def _act(self, values: _Floats, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
+        v = values[..., 1]
+        least = _REPEATS * self.belt_speed
+        ratio = v / np.maximum(1.0 + self.belt_authority * values[..., 2], _REPEATS)
+        before, estimate, stuck = np.full_like(v, np.inf), np.full_like(v, least), np.zeros(v.shape, bool)
+        if state is not None:
+            begun = broadcast_starts(starts, v)
+            memory = checked_memory(state, v.shape, v.shape, v.shape)
+            pairs = zip((before, estimate, stuck), memory, strict=True)
+            before, estimate, stuck = (np.where(begun, new, old) for new, old in pairs)
+        sticks = (np.abs(ratio - before) <= least) & (ratio > _LEAST_SHARE * estimate)
+        stuck = stuck | sticks
+        if not self.waits:
+            estimate = np.where(stuck, estimate, np.maximum(estimate, ratio))
+        estimate = np.where(sticks, ratio, estimate)
+        return self._follow(v, estimate), (ratio, estimate, stuck)
+
+
+@dataclass(frozen=True)
+class ObservingFollower(ThresholdFollower):
+    """:class:`ThresholdFollower` on the state of an observer, for sensors that see a noisy, delayed position alone.
+
+    The observer advances the nominal plant by the environment's own step under the actions taken. At each reading it
+    compares the position with that which the model had when the sensor took it, corrects the model's x by x_correction
+    and its v by v_correction times the difference, and predicts over the delay. It begins at the belt's speed,
+    because a squealing mass sticks for part of each cycle; a model that starts at rest takes longer to find the
+    velocity.
+
+    Attributes:
+        x_correction: share of the difference, in [0, 2].
+        v_correction: velocity per displacement, in [0, 1e6].
+        parameters: of the model.
+        actuator: what an action does to the model in a control interval.
+        sensor_delay: in control intervals.
+    """
+
+    x_correction: float = 0.27
+    v_correction: float = 0.18
+    _: KW_ONLY
+    parameters: OscillatorParameters = field(repr=False)
+    actuator: kernel.Actuator = field(repr=False)
+    sensor_delay: int
+
+    _ranges: ClassVar = {
+        **ThresholdFollower._ranges,
+        "x_correction": (0.0, 2.0),
+        "v_correction": (0.0, 1e6),
+        "sensor_delay": (0.0, 1000.0),
+    }
+    _needs_velocity = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sensor_delay != int(self.sensor_delay):
+            raise ValueError(f"sensor_delay must be a whole number, got {self.sensor_delay!r}")
+        object.__setattr__(self, "sensor_delay", int(self.sensor_delay))
+
+    @classmethod
+    def _known(cls, env: Any) -> dict[str, Any]:
+        nominal, task = env.nominal.unexcited, env.task
+        model = {"parameters": nominal, "actuator": task.actuator_of(nominal), "sensor_delay": task.sensor_delay}
+        return super()._known(env) | model
+
+    def _act(self, values: _Floats, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
+        x = values[..., 0] + self.readings.x_equilibrium
+        # The model's state when the sensor took this reading, and the actions since then (NaN: before the episode).
+        belt_speed = np.full_like(x, self.belt_speed)
+        model = np.stack([x, belt_speed, belt_speed], axis=-1)
+        actions = np.full((*x.shape, self.sensor_delay), np.nan)
+        if state is not None:
+            begun = broadcast_starts(starts, x)[..., None]
+            memory = checked_memory(state, model.shape, actions.shape)
+            model, actions = (np.where(begun, new, old) for new, old in zip((model, actions), memory, strict=True))
+        difference = x - model[..., 0]
+        corrections = (self.x_correction, self.v_correction, 0.0)
+        steps = [model + np.stack([gain * difference for gain in corrections], axis=-1)]
+        for i in range(self.sensor_delay):
+            steps.append(self._advance(steps[-1], actions[..., i]))
+        # As the environment takes it: clipped, in single precision.
+        action = np.clip(self._follow(steps[-1][..., 1], self.belt_speed), -1.0, 1.0).astype(np.float32).astype(float)
+        actions = np.concatenate([actions, action[..., None]], axis=-1)
+        if not self.sensor_delay:
+            steps.append(self._advance(steps[0], action))
+        return action, (steps[1], actions[..., 1:])
+
+    def _advance(self, states: _Floats, actions: _Floats) -> _Floats:
+        """Return the model's states (x, v, v_belt), shape (..., 3), a control interval later; unchanged at NaN."""
+        columns = np.ascontiguousarray(states.reshape(-1, 3).T)
+        ends, taken = np.empty_like(columns), actions.reshape(-1)
+        rewards = np.empty(taken.size)
+        kernel.control_intervals(self.parameters.plant, self.actuator, *columns, np.nan_to_num(taken), *ends, rewards)
+        # A model that cannot be advanced stays as it is, until readings have corrected it.
+        valid = np.isfinite(taken) & np.isfinite(ends).all(axis=0)
+        return np.where(valid, ends, columns).T.reshape(states.shape)
+
+
+def threshold_follower(env: Any) -> ThresholdFollower:
+    """Return the follower that an environment's observations allow, with the numbers of the package.
+
+    Args:
+        env: an :class:`SDFrictionEnv` with the belt actuator, wrapped or not. The observer is for the sensor
+            "position", the estimated belt speed for environments that draw ``belt_speed``.
+
+    Raises:
+        TypeError: if it is another kind of environment.
+        ValueError: if its actuator is not the belt's speed or has no authority.
+    """
+    task = getattr(getattr(env, "unwrapped", None), "task", None)
+    if getattr(task, "sensor", None) == "position":
+        return ObservingFollower.from_env(env)
+    if "belt_speed" in getattr(task, "randomise", {}):
+        return EstimatingFollower.from_env(env)
+    return ThresholdFollower.from_env(env)

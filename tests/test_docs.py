@@ -76,7 +76,7 @@ def test_the_python_of_a_page_runs_as_printed(page, tmp_path):
         env=ONE_THREAD,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
     )
     assert run.returncode == 0, run.stderr
 
@@ -103,7 +103,7 @@ def test_the_long_commands_of_a_page_take_the_options_that_it_shows(page, comman
 @pytest.mark.parametrize(("page", "command"), [pair for pair in OURS if not NOT_RUN.match(pair[1])])
 def test_the_commands_of_a_page_run_as_printed(page, command, tmp_path):
     arguments = [sys.executable, "-m", "sd_friction_env", *command.split()[1:]]
-    subprocess.run(arguments, cwd=tmp_path, env=ONE_THREAD, check=True, capture_output=True, timeout=120)
+    subprocess.run(arguments, cwd=tmp_path, env=ONE_THREAD, check=True, capture_output=True, timeout=600)
 
 
 @pytest.mark.parametrize(("page", "command"), [pair for pair in COMMANDS if pair[1].startswith("python scripts/")])
@@ -187,7 +187,7 @@ class Links(HTMLParser):
 def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
-    run = subprocess.run(command, check=False, cwd=ROOT, env=ONE_THREAD, capture_output=True, text=True, timeout=300)
+    run = subprocess.run(command, check=False, cwd=ROOT, env=ONE_THREAD, capture_output=True, text=True, timeout=900)
     assert run.returncode == 0, run.stderr
     assert "WARNING" not in run.stderr
     return folder

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from scripts.figures import basins, chaos, control, paper
+from scripts.figures import basins, chaos, control, paper, rule
 from sd_friction_env import Table
 
 FIGURES: dict[str, tuple[Callable[[], Table], Callable[[Table, Path], None]]] = {
@@ -24,6 +24,7 @@ FIGURES: dict[str, tuple[Callable[[], Table], Callable[[Table, Path], None]]] = 
     "basins": (basins.compute, basins.draw),
     "chaos": (chaos.compute, chaos.draw),
     "control": (control.compute, control.draw),
+    "rule": (rule.compute, rule.draw),
 }
 
 

@@ -78,7 +78,7 @@ def _controllers(
             policy, used = velocity_feedback(env_id, env_kwargs, gain)
             made[f"velocity feedback {used:g}"] = policy
         elif name == "threshold-follower":
-            made["threshold follower"] = threshold_follower(evaluation.make_env(env_id, env_kwargs))
+            made["threshold follower, default numbers"] = threshold_follower(evaluation.make_env(env_id, env_kwargs))
     return made
 
 

@@ -185,7 +185,10 @@ _FOLLOWS = {
     # slowest belt.
     "threshold": Range(1.005, 4.0, low_is="just above the slowest belt speed"),
 }
-_CORRECTIONS = {"x correction": Range(0.0, 1.0, high_is="the reading itself"), "v correction": Range(0.0, 10.0)}
+_CORRECTIONS = {
+    "x correction": Range(0.0, 1.0, high_is="the reading itself"),
+    "v correction": Range(0.0, 10.0, low_is="the model finds the velocity by itself"),
+}
 KINDS: dict[str, Kind] = {
     "velocity feedback": Kind(_velocity, lambda env: {"gain": _velocity_gain(env)}),
     "linear state feedback": Kind(_linear, _linear_ranges),

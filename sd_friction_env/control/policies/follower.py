@@ -16,7 +16,7 @@ from sd_friction_env.physics.parameters import OscillatorParameters
 _Floats = NDArray[np.float64]
 
 _REPEATS = 1e-6  # of the nominal belt speed: observations are float32, and a mass that sticks has the belt's speed
-_LEAST_SHARE = 0.01  # of the estimate: slower repetitions are those of a mass at rest
+_AT_REST = 0.2  # of the nominal belt speed: slower repetitions are those of a mass that comes to rest
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ class EstimatingFollower(ThresholdFollower):
     Attributes:
         waits: whether the belt runs slow until the mass sticks, in place of following by the largest ratio: slower from
             the passive cycle, safe from any start.
-        belt_speed: of the nominal plant; only the scale at which ratios count as equal.
+        belt_speed: of the nominal plant: only a scale. Ratios within 1e-6 of it are equal, and repetitions below a
+            fifth of it do not count: they belong to a mass that comes to rest.
 
     Raises:
         TypeError: if ``waits`` is not True or False.
@@ -117,7 +118,7 @@ class EstimatingFollower(ThresholdFollower):
             memory = checked_memory(state, v.shape, v.shape, v.shape)
             pairs = zip((before, estimate, stuck), memory, strict=True)
             before, estimate, stuck = (np.where(begun, new, old) for new, old in pairs)
-        sticks = (np.abs(ratio - before) <= least) & (ratio > _LEAST_SHARE * estimate)
+        sticks = (np.abs(ratio - before) <= least) & (ratio > _AT_REST * self.belt_speed)
         stuck = stuck | sticks
         if not self.waits:
             estimate = np.where(stuck, estimate, np.maximum(estimate, ratio))

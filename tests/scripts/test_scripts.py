@@ -29,7 +29,9 @@ def test_the_demo_trains_compares_and_draws(tmp_path):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     table = Table.from_csv(out / "comparison.csv")
     assert table["controller"].tolist() == [
-        f"{task}: {name}" for task in ("force", "belt") for name in ("passive", "linear state feedback, tuned", "PPO")
+        f"{task}: {name}"
+        for task, best in (("force", "linear state feedback"), ("belt", "threshold follower"))
+        for name in ("passive", f"{best}, tuned", "PPO")
     ]
     assert table["score"][0] == 0.0
     assert table["score"][1] > 0.98  # linear feedback by force is near the optimum

@@ -11,12 +11,15 @@ from sd_friction_env.control.policies import (
     VelocityFeedback,
     ZeroPolicy,
     load_policy,
+    rollout_follower,
     threshold_follower,
 )
 from sd_friction_env.learning import evaluation, runs
 
 # On force near the best there is. On belt the belt follows the mass, which makes matters worse at any gain.
 VELOCITY_GAINS = {"force": 1.5, "belt_speed": 1.0}
+# Controllers for the belt's speed that need no gain, by their names on the command line.
+FOLLOWERS = {"threshold-follower": threshold_follower, "rollout": rollout_follower}
 
 
 def stored_agent(path: Path) -> tuple[NetworkPolicy, dict[str, Any] | None]:
@@ -57,8 +60,8 @@ def velocity_feedback(env_id: str, env_kwargs: dict[str, Any], gain: float | Non
 
 
 def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
-    """Return the controller that --agent names: pretrained, passive, velocity-feedback, threshold-follower, a run
-    folder or a .npz file.
+    """Return the controller that --agent names: pretrained, passive, velocity-feedback, threshold-follower, rollout, a
+    run folder or a .npz file.
 
     Raises:
         ValueError: if there is no such agent, or it does not fit the environment.
@@ -71,13 +74,13 @@ def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
         return ZeroPolicy()
     if name == "velocity-feedback":
         return velocity_feedback(env_id, {}, gain)[0]
-    if name == "threshold-follower":
-        return threshold_follower(evaluation.make_env(env_id))
+    if name in FOLLOWERS:
+        return FOLLOWERS[name](evaluation.make_env(env_id))
     path = Path(name)
     if path.suffix.lower() != ".npz" and not path.is_dir():
         raise UsageError(
-            "--agent must be pretrained, velocity-feedback, threshold-follower, passive, a run folder or a policy's "
-            f".npz, got {name!r}"
+            "--agent must be pretrained, velocity-feedback, threshold-follower, rollout, passive, a run folder or a "
+            f"policy's .npz, got {name!r}"
         )
     policy, _ = stored_agent(path)
     check_fit(path, policy, env_id, {})
@@ -90,6 +93,7 @@ def title_of(name: str, policy: Policy) -> str:
         "passive": "no control",
         "velocity-feedback": "velocity feedback",
         "threshold-follower": "threshold follower",
+        "rollout": "rollout of the threshold follower",
     }
     algorithm = str(getattr(policy, "metadata", {}).get("algorithm", "trained"))
     return titles.get(name, f"{algorithm.upper()} agent")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sd_friction_env import Table
-from sd_friction_env.cli.agents import agent_of, check_fit, stored_agent, velocity_feedback
+from sd_friction_env.cli.agents import FOLLOWERS, agent_of, check_fit, stored_agent, velocity_feedback
 from sd_friction_env.cli.options import (
     Command,
     FailedError,
@@ -25,10 +25,10 @@ from sd_friction_env.cli.options import (
     named_environment,
     numbers,
 )
-from sd_friction_env.control.policies import ConstantPolicy, Policy, ZeroPolicy, threshold_follower
+from sd_friction_env.control.policies import ConstantPolicy, Policy, ZeroPolicy
 from sd_friction_env.learning import classical, evaluation, grids
 
-CONTROLLERS = ("passive", "velocity-feedback", "threshold-follower", "constant", "classical")
+CONTROLLERS = ("passive", "velocity-feedback", *FOLLOWERS, "constant", "classical")
 
 TEXT = """\
 Passive always comes first. score: 0 passive, 1 the optimum where one is stored ("-" where none is), over the episodes
@@ -77,8 +77,9 @@ def _controllers(
         elif name == "velocity-feedback":
             policy, used = velocity_feedback(env_id, env_kwargs, gain)
             made[f"velocity feedback {used:g}"] = policy
-        elif name == "threshold-follower":
-            made["threshold follower, default numbers"] = threshold_follower(evaluation.make_env(env_id, env_kwargs))
+        elif name in FOLLOWERS:
+            follower = FOLLOWERS[name](evaluation.make_env(env_id, env_kwargs))
+            made[f"{name.replace('-', ' ')}, default numbers"] = follower
     return made
 
 
@@ -149,7 +150,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _add_grid(parser: argparse.ArgumentParser) -> None:
     add_environment(parser, arguments=False)
-    text = "pretrained (default), velocity-feedback, threshold-follower, passive, a run folder, or a policy's .npz"
+    text = f"pretrained (default), velocity-feedback, {', '.join(FOLLOWERS)}, passive, a run folder, or a policy's .npz"
     parser.add_argument("--agent", default="pretrained", help=text)
     text = "a parameter of the plant with its values or ranges from:to:step; several make a grid"
     parser.add_argument("--over", nargs="+", action="append", required=True, metavar=("NAME", "VALUE"), help=text)

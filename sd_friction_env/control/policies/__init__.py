@@ -22,8 +22,10 @@ from sd_friction_env.control.policies.follower import (
     EstimatingFollower,
     ObservingFollower,
     ThresholdFollower,
+    rollout_follower,
     threshold_follower,
 )
+from sd_friction_env.control.policies.lookahead import Model, RolloutPolicy
 from sd_friction_env.control.policies.network import NetworkPolicy, PolicyFileError, load_policy
 from sd_friction_env.control.policies.policy import Actions, ConstantPolicy, Policy, State, ZeroPolicy
 
@@ -35,16 +37,19 @@ __all__ = [
     "Feedback",
     "FilteredFeedback",
     "LinearFeedback",
+    "Model",
     "NetworkPolicy",
     "ObservingFollower",
     "Policy",
     "PolicyFileError",
     "Readings",
+    "RolloutPolicy",
     "SlidingMode",
     "State",
     "ThresholdFollower",
     "VelocityFeedback",
     "ZeroPolicy",
     "load_policy",
+    "rollout_follower",
     "threshold_follower",
 ]

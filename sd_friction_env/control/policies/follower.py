@@ -2,16 +2,15 @@
 the belt's speed or the velocity is not known.
 """
 
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env import kernel
 from sd_friction_env.control.policies.feedback import Feedback
+from sd_friction_env.control.policies.lookahead import Model, RolloutPolicy
 from sd_friction_env.control.policies.policy import State, broadcast_starts, checked_memory
-from sd_friction_env.physics.parameters import OscillatorParameters
 
 _Floats = NDArray[np.float64]
 
@@ -139,17 +138,17 @@ class ObservingFollower(ThresholdFollower):
     Attributes:
         x_correction: share of the difference, in [0, 2].
         v_correction: velocity per displacement, in [0, 1e6].
-        parameters: of the model.
-        actuator: what an action does to the model in a control interval.
+        model: of the plant.
         sensor_delay: in control intervals.
+        rollout: None, or the look-ahead controller that acts on the observed state in place of the rule.
     """
 
     x_correction: float = 0.27
     v_correction: float = 0.18
     _: KW_ONLY
-    parameters: OscillatorParameters = field(repr=False)
-    actuator: kernel.Actuator = field(repr=False)
+    model: Model = field(repr=False)
     sensor_delay: int
+    rollout: RolloutPolicy | None = field(default=None, repr=False)
 
     _ranges: ClassVar = {
         **ThresholdFollower._ranges,
@@ -167,9 +166,7 @@ class ObservingFollower(ThresholdFollower):
 
     @classmethod
     def _known(cls, env: Any) -> dict[str, Any]:
-        nominal, task = env.nominal.unexcited, env.task
-        model = {"parameters": nominal, "actuator": task.actuator_of(nominal), "sensor_delay": task.sensor_delay}
-        return super()._known(env) | model
+        return super()._known(env) | {"model": Model.from_env(env), "sensor_delay": env.task.sensor_delay}
 
     def _act(self, values: _Floats, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
         x = values[..., 0] + self.readings.x_equilibrium
@@ -187,7 +184,9 @@ class ObservingFollower(ThresholdFollower):
         for i in range(self.sensor_delay):
             steps.append(self._advance(steps[-1], actions[..., i]))
         # As the environment takes it: clipped, in single precision.
-        action = np.clip(self._follow(steps[-1][..., 1], self.belt_speed), -1.0, 1.0).astype(np.float32).astype(float)
+        now = steps[-1]
+        wanted = self.rollout.best_actions(now) if self.rollout else self._follow(now[..., 1], self.belt_speed)
+        action = np.clip(wanted, -1.0, 1.0).astype(np.float32).astype(float)
         actions = np.concatenate([actions, action[..., None]], axis=-1)
         if not self.sensor_delay:
             steps.append(self._advance(steps[0], action))
@@ -195,13 +194,10 @@ class ObservingFollower(ThresholdFollower):
 
     def _advance(self, states: _Floats, actions: _Floats) -> _Floats:
         """Return the model's states (x, v, v_belt), shape (..., 3), a control interval later; unchanged at NaN."""
-        columns = np.ascontiguousarray(states.reshape(-1, 3).T)
-        ends, taken = np.empty_like(columns), actions.reshape(-1)
-        rewards = np.empty(taken.size)
-        kernel.control_intervals(self.parameters.plant, self.actuator, *columns, np.nan_to_num(taken), *ends, rewards)
+        ends, _ = self.model.step(states, np.nan_to_num(actions))
         # A model that cannot be advanced stays as it is, until readings have corrected it.
-        valid = np.isfinite(taken) & np.isfinite(ends).all(axis=0)
-        return np.where(valid, ends, columns).T.reshape(states.shape)
+        valid = np.isfinite(actions) & np.isfinite(ends).all(axis=-1)
+        return np.where(valid[..., None], ends, states)
 
 
 def threshold_follower(env: Any) -> ThresholdFollower:
@@ -221,3 +217,19 @@ def threshold_follower(env: Any) -> ThresholdFollower:
     if "belt_speed" in getattr(task, "randomise", {}):
         return EstimatingFollower.from_env(env)
     return ThresholdFollower.from_env(env)
+
+
+def rollout_follower(env: Any) -> Feedback:
+    """Return the look-ahead controller of an environment: the rollout of its :func:`threshold_follower`.
+
+    It knows the nominal plant. Where the sensor sees the position only, it acts on the observer's state.
+
+    Raises:
+        TypeError, ValueError: as :func:`threshold_follower`.
+    """
+    follower = threshold_follower(env)
+    if not isinstance(follower, ObservingFollower):
+        return RolloutPolicy.from_env(env, ThresholdFollower.from_env(env))
+    readings = replace(follower.readings, sees_velocity=True)
+    rule = ThresholdFollower(readings=readings, belt_speed=follower.belt_speed, belt_authority=follower.belt_authority)
+    return replace(follower, rollout=RolloutPolicy(rule, readings=readings, model=follower.model))

@@ -173,6 +173,12 @@ class _Step:
         self.parameters, self.task, self.by = parameters, task, tuple(by)
         self.on_singular = checked_choice("on_singular", on_singular, get_args(OnSingular))
 
+        @functools.lru_cache(maxsize=64)  # a rollout asks for the same ones at every step
+        def parameters_with(*values: float) -> OscillatorParameters:
+            return parameters.replace(**dict(zip(self.by, values, strict=True)))
+
+        self.parameters_with = parameters_with
+
     def shapes(self, derivatives: bool) -> list[tuple[int, ...]]:
         """Return the shapes of what one step gives: its results, and their derivatives if wanted."""
         return [(_RESULTS,), (_RESULTS, _START + len(self.by))][: 1 + derivatives]
@@ -217,7 +223,7 @@ class _Step:
 
     def _of_one_plant(self, derivatives: bool, rows: FloatArray) -> list[FloatArray]:
         *values, time = rows[0, _START:].tolist()
-        parameters = self.parameters.replace(**dict(zip(self.by, values, strict=True)))
+        parameters = self.parameters_with(*values)
         state, action = rows[:, :3], rows[:, 3]
         if not derivatives:
             starts, _ = starts_of(state, action)

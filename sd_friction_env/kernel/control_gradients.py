@@ -8,7 +8,7 @@ from sd_friction_env.kernel.codes import FORCE, MAX_EVENTS, OK, UNKNOWN
 from sd_friction_env.kernel.compilation import compiled, entry
 from sd_friction_env.kernel.interval import actuation, interval_averages
 from sd_friction_env.kernel.plant import Drive, State, at_time
-from sd_friction_env.kernel.sensitivity import SMOOTH, follow_with_tangents
+from sd_friction_env.kernel.sensitivity import AT_BORDER, SMOOTH, follow_with_tangents
 from sd_friction_env.kernel.variation import (
     TANGENT_A_BELT,
     TANGENT_BELT,
@@ -33,12 +33,16 @@ OUTCOMES = (
 (OUT_VIBRATION, OUT_EFFORT, OUT_STICK_COST), N_OUTCOMES = range(8, 11), 11
 CAUSES = ("x", "v", "v_belt", "action")
 BY_X, BY_V, BY_V_BELT, BY_ACTION, N_CAUSES = range(5)
+_AT_LIMIT = 1e-12  # so close to the limit of the belt's acceleration, relative to it, rounding decides
 _STATE = 3  # the first outcomes and causes are the state
 
 
 @compiled
 def _seed_tangents(actuator, v_belt, action, belt_speed_changes, tangents):
-    """Write the tangents of an interval's start: by x, v, v_belt and action, and by the plant's parameters."""
+    """Write the tangents of an interval's start: by x, v, v_belt and action, and by the plant's parameters.
+
+    Return whether the belt's acceleration is just at its limit, where they have two values.
+    """
     kind, authority, a_limit, belt_speed, interval, _, _ = actuator
     tangents[:] = 0.0
     tangents[TANGENT_X, BY_X] = 1.0
@@ -46,7 +50,7 @@ def _seed_tangents(actuator, v_belt, action, belt_speed_changes, tangents):
     tangents[TANGENT_BELT, BY_V_BELT] = 1.0
     if kind == FORCE:
         tangents[TANGENT_U, BY_ACTION] = authority
-        return
+        return False
     slope = ((1.0 + authority * action) * belt_speed - v_belt) / interval
     if abs(slope) < a_limit:
         tangents[TANGENT_A_BELT, BY_V_BELT] = -1.0 / interval
@@ -54,18 +58,21 @@ def _seed_tangents(actuator, v_belt, action, belt_speed_changes, tangents):
         for j in range(len(belt_speed_changes)):
             change = belt_speed_changes[j] / interval
             tangents[TANGENT_A_BELT, N_CAUSES + j] = (1.0 + authority * action) * change
+    return abs(abs(slope) - a_limit) <= _AT_LIMIT * a_limit
 
 
 @compiled
 def _interval(plant, actuator, state, v_belt, action, directions, changes, tangents, events, work, row, jacobian):
-    """Apply an action for one interval; write what it comes to and the derivatives; return the motion.
+    """Apply an action for one interval; write what it comes to and the derivatives.
+
+    Return the motion, and whether its derivative exists.
 
     ``changes`` are those of the nominal belt speed with the parameters.
     """
     kind, authority, a_limit, belt_speed, interval, w_effort, w_stick = actuator
     u, a_belt = actuation(kind, authority, a_limit, belt_speed, interval, v_belt, action)
     drive = Drive(v_belt, a_belt, u)
-    _seed_tangents(actuator, v_belt, action, changes, tangents)
+    at_limit = _seed_tangents(actuator, v_belt, action, changes, tangents)
     end = follow_with_tangents(plant, UNKNOWN, state, drive, interval, tangents, directions, events, work)
     averages = interval_averages(
         state.x, end.x, end.int_v2, end.stick_time, end.int_fv, action, u, belt_speed, interval, w_effort, w_stick
@@ -93,7 +100,7 @@ def _interval(plant, actuator, state, v_belt, action, directions, changes, tange
         jacobian[OUT_VIBRATION, j] = vibration
         jacobian[OUT_EFFORT, j] = effort
         jacobian[OUT_STICK_COST, j] = -w_stick * by_stick
-    return end
+    return end, max(end.derivative, AT_BORDER) if at_limit else end.derivative
 
 
 @entry
@@ -112,10 +119,10 @@ def control_intervals_with_tangents(plant, actuator, starts, directions, changes
         state = State(starts[BY_X, i], starts[BY_V, i])
         v_belt, action = starts[BY_V_BELT, i], starts[BY_ACTION, i]
         row, jacobian = outcomes[i], jacobians[i]
-        end = _interval(
+        end, derivative = _interval(
             plant, actuator, state, v_belt, action, directions, changes, tangents, events, work, row, jacobian
         )
-        codes[0, i] = end.derivative
+        codes[0, i] = derivative
         codes[1, i] = end.status
         if end.status != OK:
             jacobian[:] = math.nan
@@ -138,10 +145,10 @@ def return_with_gradient(plant, actuator, state, v_belt, actions, directions, ch
     worst = SMOOTH
     for t in range(n):
         now = at_time(plant, t * actuator.interval)
-        end = _interval(
+        end, derivative = _interval(
             now, actuator, state, v_belt, actions[t], directions, changes, tangents, events, work, row, jacobians[t]
         )
-        worst = max(worst, end.derivative)
+        worst = max(worst, derivative)
         total += row[OUT_REWARD]
         if end.status != OK:
             by_actions[:] = math.nan

@@ -68,7 +68,7 @@ SMOOTH, FROM_BELT, AT_BORDER, TOUCHED = 0, 1, 2, 3
 DERIVATIVE_NAMES = {
     SMOOTH: "exists",
     FROM_BELT: "starts on the belt: exists along v = v_belt only",
-    AT_BORDER: "one-sided: an event falls on the start or the end",
+    AT_BORDER: "one-sided: an event falls on the start or the end, or the belt accelerates just at its limit",
     TOUCHED: "does not exist: an event's surface is touched, not passed",
 }
 

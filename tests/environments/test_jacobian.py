@@ -136,7 +136,9 @@ def test_where_contact_is_lost_there_is_no_derivative():
 def test_an_event_on_the_border_of_a_step_is_said():
     """A mass that lands on the belt within 1e-9 of the start."""
     state = [0.3, 0.2 + 1e-11, 0.2]
-    assert step_with_jacobian(state, 0.0).reasons == ["one-sided: an event falls on the start or the end"]
+    assert step_with_jacobian(state, 0.0).reasons == [
+        "one-sided: an event falls on the start or the end, or the belt accelerates just at its limit"
+    ]
     assert not return_with_gradient(state, [0.0]).smooth
 
 
@@ -206,3 +208,14 @@ def test_what_does_not_fit_is_refused(changes, error, message):
 def test_a_return_refuses_what_does_not_fit(state, actions, message):
     with pytest.raises(ValueError, match=message):
         return_with_gradient(state, actions)
+
+
+def test_a_belt_that_accelerates_just_at_its_limit_has_a_one_sided_derivative():
+    task = Task(actuator="belt_speed")
+    for action, code in (
+        (0.5, kernel.AT_BORDER),
+        (-0.5, kernel.AT_BORDER),
+        (0.499, kernel.SMOOTH),
+        (0.6, kernel.SMOOTH),
+    ):
+        assert step_with_jacobian((0.5, -0.3, 0.2), action, task=task).derivative == code, action

@@ -169,6 +169,21 @@ def test_a_class_without_a_method_or_with_other_arguments_is_refused_by_name():
         spring_law(int)
 
 
+def test_laws_of_two_classes_with_the_same_numbers_are_two():
+    @friction_law
+    class Another(Coulomb):
+        pass
+
+    one, other = (OscillatorParameters(friction=law(0.3, 0.2)) for law in (Coulomb, Another))
+    assert one != other
+    assert one == OscillatorParameters(friction=Coulomb(0.3, 0.2))
+    assert hash(one) == hash(OscillatorParameters(friction=Coulomb(0.3, 0.2)))
+    assert len({one, other}) == 2  # what is kept of one is not taken for the other's
+    table = tabulated_friction([0.0, 0.5, 1.0], [0.3, 0.1, 0.2])
+    assert table == tabulated_friction([0.0, 0.5, 1.0], [0.3, 0.1, 0.2])
+    assert table != tabulated_friction([0.0, 0.5, 1.0], [0.3, 0.1, 0.25])
+
+
 def test_a_wrong_derivative_is_refused_with_the_place_and_both_values():
     @friction_law
     class Wrong(NamedTuple):
@@ -216,7 +231,7 @@ def test_a_law_that_makes_no_sense_is_refused(law, message):
 
 def test_whole_numbers_in_a_law_are_taken_as_floats():
     law = OscillatorParameters(friction=OwnStribeck(1, 0, 0)).friction
-    assert law == (1.0, 0.0, 0.0)
+    assert tuple(law) == (1.0, 0.0, 0.0)
     assert all(type(number) is float for number in law)
     check_spring_law(OwnLinear(2))
 

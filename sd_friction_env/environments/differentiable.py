@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sd_friction_env import kernel
 from sd_friction_env.environments.jacobian import (
     StepJacobian,
+    control_steps,
     parameter_directions,
     plant_at,
     starts_of,
@@ -226,11 +227,11 @@ class _Step:
         parameters = self.parameters_with(*values)
         state, action = rows[:, :3], rows[:, 3]
         if not derivatives:
-            starts, _ = starts_of(state, action)
-            ends = np.empty((_RESULTS, len(rows)))
+            starts_of(state, action)  # checks them
             plant, actuator = plant_at(parameters, time), self.task.actuator_of(parameters)
-            if not kernel.control_intervals(plant, actuator, *starts, *ends):
-                return [ends.T]
+            ends, rewards, failures = control_steps(plant, actuator, state, action)
+            if not failures:
+                return [np.column_stack((ends, rewards))]
         found = step_with_jacobian(state, action, parameters, self.task, by=self.by, time=time)
         failed = found.status != kernel.OK
         self._report(found, rows, failed | (derivatives & (found.derivative > kernel.FROM_BELT)))

@@ -87,6 +87,23 @@ class ReturnGradient(NamedTuple):
     smooth: bool
 
 
+def control_steps(
+    plant: kernel.Plant, actuator: kernel.Actuator, states: FloatArray, actions: FloatArray
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return states (x, v, v_belt) a control interval later, (..., 3), rewards, (...), and how many steps failed.
+
+    Args:
+        plant, actuator: as the kernel takes them.
+        states, actions: (..., 3) and (...), not checked.
+    """
+    columns = np.ascontiguousarray(states.reshape(-1, 3).T)
+    ends, rewards = np.empty_like(columns), np.empty(columns.shape[1])
+    failures = kernel.control_intervals(
+        plant, actuator, *columns, np.ascontiguousarray(actions.reshape(-1)), *ends, rewards
+    )
+    return ends.T.reshape(states.shape), rewards.reshape(actions.shape), failures
+
+
 def step_with_jacobian(
     state: ArrayLike,
     action: ArrayLike,

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from sd_friction_env import kernel
 from sd_friction_env.control.policies.feedback import Feedback
 from sd_friction_env.control.policies.policy import State
+from sd_friction_env.environments.jacobian import control_steps
 from sd_friction_env.physics.parameters import OscillatorParameters, checked_count
 
 _Floats = NDArray[np.float64]
@@ -34,11 +35,7 @@ class Model:
 
     def step(self, states: _Floats, actions: _Floats) -> tuple[_Floats, _Floats]:
         """Return the states (x, v, v_belt), shape (..., 3), a control interval later, and the rewards, shape (...)."""
-        columns = np.ascontiguousarray(states.reshape(-1, 3).T)
-        ends, rewards = np.empty_like(columns), np.empty(columns.shape[1])
-        taken = np.ascontiguousarray(actions.reshape(-1))
-        kernel.control_intervals(self.parameters.plant, self.actuator, *columns, taken, *ends, rewards)
-        return ends.T.reshape(states.shape), rewards.reshape(actions.shape)
+        return control_steps(self.parameters.plant, self.actuator, states, actions)[:2]
 
 
 @dataclass(frozen=True)

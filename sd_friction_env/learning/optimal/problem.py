@@ -9,10 +9,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sd_friction_env import kernel
 from sd_friction_env.environments import ids
 from sd_friction_env.environments.ids import environment_id
-from sd_friction_env.environments.jacobian import step_with_jacobian
+from sd_friction_env.environments.jacobian import control_steps, step_with_jacobian
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.environments.task import Task
 from sd_friction_env.physics.parameters import OscillatorParameters
@@ -122,20 +121,10 @@ class Problem:
 
 def step_plant(task: Task, parameters: OscillatorParameters, states: Array, actions: Array) -> tuple[Array, Array]:
     """Return what :meth:`Problem.step` returns, for one plant."""
-    columns = np.ascontiguousarray(states.reshape(-1, 3).T)
-    ends = np.empty_like(columns)
-    rewards = np.empty(columns.shape[1])
-    failures = kernel.control_intervals(
-        parameters.plant,
-        task.actuator_of(parameters),
-        *columns,
-        np.ascontiguousarray(actions.reshape(-1)),
-        *ends,
-        rewards,
-    )
+    ends, rewards, failures = control_steps(parameters.plant, task.actuator_of(parameters), states, actions)
     if failures:
         raise RuntimeError(f"{failures} of {rewards.size} states lost contact or were not integrated")
-    return ends.T.reshape(*actions.shape, 3), rewards.reshape(actions.shape)
+    return ends, rewards
 
 
 def make_problem(env_id: str, seeds: Sequence[int]) -> Problem:

@@ -43,7 +43,7 @@ def _derivatives(problem: Problem, states: Array, actions: Array) -> _Derivative
             actions_there = np.clip(actions, -1.0 + h, 1.0 - h) + by
         found = problem.jacobians(states_there, actions_there)[..., rows, :][..., columns]
         found[..., -1, :] *= -1.0
-        return np.nan_to_num(found)
+        return np.nan_to_num(found)  # next to a loss of contact: only the quadratic model is worse for it
 
     first = at(0, 0.0)
     second = np.stack([(at(i, h) - at(i, -h)) / (2.0 * h) for i in range(size + 1)], axis=-1)

@@ -12,11 +12,13 @@ import pytest
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import PolicyFileError
 from sd_friction_env.environments.single import SDFrictionEnv
+from sd_friction_env.environments.task import passive_motion
 from sd_friction_env.learning import evaluation, optimal, scores
 from sd_friction_env.learning.evaluation import EVALUATION_SEEDS
 from sd_friction_env.learning.optimal import OPEN, RANDOMISED, SENSED, TASKS, OptimalPolicy
 
-STORED = [*TASKS.values(), *RANDOMISED.values()]
+OWN = [OPEN[tier]["belt"] for tier in ("blind-hard", "drifting", "excited")]  # open tiers with a reference of their own
+STORED = [*TASKS.values(), *RANDOMISED.values(), *OWN]
 
 
 def write_unsealed(path, content):
@@ -66,8 +68,8 @@ def test_optimum_beats_simple_controllers_from_every_start(env_id):
 
 def sum_of_rewards(problem, law):
     states, total = problem.starts, 0.0
-    for _ in range(problem.steps):
-        states, rewards = problem.step(states, law(states))
+    for t in range(problem.steps):
+        states, rewards = problem.step(states, law(states), t)
         total = total + rewards
     return total
 
@@ -100,7 +102,7 @@ def test_sensed_tier_has_the_nominal_optimum_for_a_replay_there_returns_the_same
     np.testing.assert_allclose(replayed, reference[:5], rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("env_id", [*RANDOMISED.values(), *(OPEN[tier]["belt"] for tier in ("drifting", "excited"))])
+@pytest.mark.parametrize("env_id", [*RANDOMISED.values(), *OWN])
 def test_problem_of_many_plants_is_each_of_them_alone(env_id):
     problem = optimal.make_problem(env_id, range(4))
     assert len(problem.plants) == 4
@@ -112,6 +114,13 @@ def test_problem_of_many_plants_is_each_of_them_alone(env_id):
     np.testing.assert_allclose(env_returns, together, rtol=0.0, atol=1e-9)
     with pytest.raises(ValueError, match="one plant"):
         optimal.make_grid(problem, (9, 9, 9)[: problem.dimensions])
+
+
+def test_a_grid_has_room_for_the_kick_where_passive_motion_dies_out():
+    problem = optimal.make_problem("SDFriction/BeltSpeedBlindHard-v0", [1_000_017])
+    assert passive_motion(problem.parameters[0]).amplitude == 0.0
+    grid = optimal.make_grid(problem, (9, 9, 9))
+    assert all(low < at < high for low, at, high in zip(grid.lows, problem.starts[0] - [0, 0.1, 0], grid.highs))
 
 
 def test_batch_step_is_the_environment_step():

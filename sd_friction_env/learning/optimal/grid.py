@@ -76,8 +76,9 @@ def make_grid(problem: Problem, sizes: Sequence[int]) -> Grid:
     assert cycle is not None
     belt_speed = parameters.belt_speed
     x_min, x_max = min(cycle.x_min, problem.starts[:, 0].min()), max(cycle.x_max, problem.starts[:, 0].max())
-    # Above v_b1 passive motion dies out, and an episode starts with a kick.
     amplitude = max(cycle.amplitude, 0.5 * (x_max - x_min), -problem.starts[:, 1].min())
+    if amplitude <= 0.0:  # above v_b1 passive motion dies out, and an episode starts with a kick
+        amplitude = np.abs(problem.starts[:, 1]).max()
     margin = 0.4 * amplitude
     swing = problem.task.belt_authority * belt_speed if belt_moves else 0.0
     v_rel_low = -(belt_speed + swing + 1.3 * amplitude)

@@ -9,9 +9,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sd_friction_env.control.shooting import rollout
 from sd_friction_env.environments import ids
 from sd_friction_env.environments.ids import environment_id
-from sd_friction_env.environments.jacobian import control_steps, step_with_jacobian
+from sd_friction_env.environments.jacobian import control_jacobians, control_steps
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.environments.task import Task
 from sd_friction_env.physics.parameters import OscillatorParameters
@@ -96,8 +97,8 @@ class Problem:
         found = np.empty((*actions.shape, 4, 4))
         for parameters, rows in self.plants.items():
             part = slice(None) if len(self.plants) == 1 else rows
-            step = step_with_jacobian(states[part].reshape(-1, 3), actions[part].reshape(-1), parameters, self.task)
-            found[part] = step.jacobian[:, :4].reshape(*actions[part].shape, 4, 4)
+            actuator = self.task.actuator_of(parameters)
+            found[part] = control_jacobians(parameters.plant, actuator, states[part], actions[part])
         return found
 
     def rollout(self, actions: Array) -> tuple[Array, Array]:
@@ -106,12 +107,7 @@ class Problem:
         Args:
             actions: one sequence per start, shape (n, steps).
         """
-        states = np.empty((len(self.starts), self.steps + 1, 3))
-        rewards = np.empty(actions.shape)
-        states[:, 0] = self.starts
-        for t in range(self.steps):
-            states[:, t + 1], rewards[:, t] = self.step(states[:, t], actions[:, t])
-        return states, rewards
+        return rollout(self, self.starts, actions)
 
     def returns(self, actions: Array) -> Array:
         """Return the undiscounted sum of rewards of each sequence, shape (n,)."""

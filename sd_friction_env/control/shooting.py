@@ -20,11 +20,11 @@ class Dynamics(Protocol):
     def dimensions(self) -> int:
         """2 or 3."""
 
-    def step(self, states: Array, actions: Array) -> tuple[Array, Array]:
-        """Return the states (x, v, v_belt) a control interval later, shape (..., 3), and the rewards, shape (...)."""
+    def step(self, states: Array, actions: Array, t: int) -> tuple[Array, Array]:
+        """Return the states (x, v, v_belt) after control interval t, shape (..., 3), and the rewards, shape (...)."""
 
     def jacobians(self, states: Array, actions: Array) -> Array:
-        """Return the derivatives of (x, v, v_belt, reward) by (x, v, v_belt, action), shape (..., 4, 4)."""
+        """Return the derivatives of (x, v, v_belt, reward) by (x, v, v_belt, action), shape (n, steps, 4, 4)."""
 
 
 _DIFFERENCE = 1e-4  # half-width of central differences of the exact Jacobian
@@ -124,7 +124,7 @@ def follow(
         off = now[..., :size] - states[:, None, t, :size]
         wanted = actions[:, None, t] + changes[..., t] + np.sum(gains[..., t, :] * off, axis=-1)
         taken[..., t] = np.clip(wanted, -1.0, 1.0)
-        now, rewards = dynamics.step(now, taken[..., t])
+        now, rewards = dynamics.step(now, taken[..., t], t)
         returns += rewards
     return taken, returns
 
@@ -139,7 +139,7 @@ def rollout(dynamics: Dynamics, starts: Array, actions: Array) -> tuple[Array, A
     states, rewards = np.empty((n, steps + 1, 3)), np.empty((n, steps))
     states[:, 0] = starts
     for t in range(steps):
-        states[:, t + 1], rewards[:, t] = dynamics.step(states[:, t], actions[:, t])
+        states[:, t + 1], rewards[:, t] = dynamics.step(states[:, t], actions[:, t], t)
     return states, rewards
 
 

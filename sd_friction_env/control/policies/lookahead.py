@@ -48,8 +48,11 @@ class Model:
         """Number of state variables that change: 3 where the belt moves, otherwise 2."""
         return 3 if self.actuator.kind == kernel.BELT_SPEED else 2
 
-    def step(self, states: _Floats, actions: _Floats) -> tuple[_Floats, _Floats]:
-        """Return the states (x, v, v_belt), shape (..., 3), a control interval later, and the rewards, shape (...)."""
+    def step(self, states: _Floats, actions: _Floats, t: int = 0) -> tuple[_Floats, _Floats]:
+        """Return the states (x, v, v_belt), shape (..., 3), a control interval later, and the rewards, shape (...).
+
+        The number of the interval, ``t``, does not matter: the plant stays as it is.
+        """
         return control_steps(self.parameters.plant, self.actuator, states, actions)[:2]
 
     def jacobians(self, states: _Floats, actions: _Floats) -> _Floats:

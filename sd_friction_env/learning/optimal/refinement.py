@@ -77,7 +77,7 @@ def settle(problem: Problem, actions: Array, gains: Sequence[float] = (0.1, 0.25
         now = np.repeat(states[:, None, first], m, axis=1)
         for t in range(first, problem.steps):
             ends[..., t] = np.clip(factors * now[..., 1], -1.0, 1.0)
-            now, reward = problem.step(now, ends[..., t])
+            now, reward = problem.step(now, ends[..., t], t)
             totals += reward
         candidates.append(ends[np.arange(n), totals.argmax(axis=1)])
     return best_of(problem, candidates)

@@ -33,9 +33,12 @@ def greedy_actions(
             sequences[:, t] = prefix[:, t]
         else:
             sequences[:, t] = look_ahead(
-                problem.step, functools.partial(value.grid.interpolate, value.after_first), states, count
+                functools.partial(problem.step, t=t),
+                functools.partial(value.grid.interpolate, value.after_first),
+                states,
+                count,
             )
-        states, _ = problem.step(states, sequences[:, t])
+        states, _ = problem.step(states, sequences[:, t], t)
     return sequences
 
 
@@ -98,7 +101,7 @@ def beam_actions(
     rows = np.arange(n)[:, None]
     for t in progress(range(steps), "beam search"):
         ends, rewards = problem.step(
-            np.repeat(states[:, :, None], count, axis=2), np.broadcast_to(tried, (n, width, count))
+            np.repeat(states[:, :, None], count, axis=2), np.broadcast_to(tried, (n, width, count)), t
         )
         sums = totals[:, :, None] + rewards
         scores = (sums + value.grid.interpolate(value.after_first, ends)).reshape(n, -1)

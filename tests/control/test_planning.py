@@ -138,7 +138,9 @@ def test_samples_come_from_the_seed_and_always_include_the_base_controller():
     actions = {seed: SamplingPolicy.from_env(env, seed=seed, horizon=30).predict(seen)[0][0] for seed in (0, 1)}
     assert actions[0] != actions[1]
     still = SamplingPolicy.from_env(env, spread=0.0, horizon=30)
-    assert still.predict(seen)[0] == ThresholdFollower.from_env(env).predict(seen)[0]
+    rule = ThresholdFollower.from_env(env).predict(seen)[0]
+    assert still.predict(seen)[0] == rule
+    assert still.predict(seen, (np.full(30, -2.0),))[0] == rule  # after a plan that is worse
 
 
 def test_a_value_two_steps_ahead_finds_the_best_pair_of_actions():

@@ -140,7 +140,7 @@ def test_samples_come_from_the_seed_and_always_include_the_base_controller():
     still = SamplingPolicy.from_env(env, spread=0.0, horizon=30)
     rule = ThresholdFollower.from_env(env).predict(seen)[0]
     assert still.predict(seen)[0] == rule
-    assert still.predict(seen, (np.full(30, -2.0),))[0] == rule  # after a plan that is worse
+    assert still.predict(seen, (np.full(30, 2.0),))[0] == rule  # after a plan that is worse
 
 
 def test_a_value_two_steps_ahead_finds_the_best_pair_of_actions():

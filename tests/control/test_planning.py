@@ -134,7 +134,7 @@ def test_plans_are_the_same_alone_and_in_a_batch_and_begin_anew_with_an_episode(
 
 def test_samples_come_from_the_seed_and_always_include_the_base_controller():
     env = gym.make(BELT).unwrapped
-    seen = observations(env, [0.6, 0.05, 0.2])
+    seen = observations(env, [0.6, 0.02, 0.2])
     actions = {seed: SamplingPolicy.from_env(env, seed=seed, horizon=30).predict(seen)[0][0] for seed in (0, 1)}
     assert actions[0] != actions[1]
     still = SamplingPolicy.from_env(env, spread=0.0, horizon=30)

@@ -1,13 +1,16 @@
 """Agents and controllers as commands name them."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sd_friction_env import ENVIRONMENT_IDS, load_pretrained
 from sd_friction_env.cli.options import UsageError
 from sd_friction_env.control.policies import (
+    GradientPolicy,
     NetworkPolicy,
     Policy,
+    SamplingPolicy,
     VelocityFeedback,
     ZeroPolicy,
     load_policy,
@@ -15,11 +18,18 @@ from sd_friction_env.control.policies import (
     threshold_follower,
 )
 from sd_friction_env.learning import evaluation, runs
+from sd_friction_env.learning.optimal import OptimalPolicy
 
 # On force near the best there is. On belt the belt follows the mass, which makes matters worse at any gain.
 VELOCITY_GAINS = {"force": 1.5, "belt_speed": 1.0}
-# Controllers for the belt's speed that need no gain, by their names on the command line.
-FOLLOWERS = {"threshold-follower": threshold_follower, "rollout": rollout_follower}
+# Controllers made from an environment alone, by their names on the command line.
+MADE_FROM_ENV: dict[str, Callable[[Any], Policy]] = {
+    "threshold-follower": threshold_follower,
+    "rollout": rollout_follower,
+    "value-lookahead": OptimalPolicy.from_env,
+    "sampling-mpc": SamplingPolicy.from_env,
+    "gradient-mpc": GradientPolicy.from_env,
+}
 
 
 def stored_agent(path: Path) -> tuple[NetworkPolicy, dict[str, Any] | None]:
@@ -60,8 +70,8 @@ def velocity_feedback(env_id: str, env_kwargs: dict[str, Any], gain: float | Non
 
 
 def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
-    """Return the controller that --agent names: pretrained, passive, velocity-feedback, threshold-follower, rollout, a
-    run folder or a .npz file.
+    """Return the controller that --agent names: pretrained, passive, velocity-feedback, one of ``MADE_FROM_ENV``, a run
+    folder or a .npz file.
 
     Raises:
         ValueError: if there is no such agent, or it does not fit the environment.
@@ -74,12 +84,12 @@ def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
         return ZeroPolicy()
     if name == "velocity-feedback":
         return velocity_feedback(env_id, {}, gain)[0]
-    if name in FOLLOWERS:
-        return FOLLOWERS[name](evaluation.make_env(env_id))
+    if name in MADE_FROM_ENV:
+        return MADE_FROM_ENV[name](evaluation.make_env(env_id))
     path = Path(name)
     if path.suffix.lower() != ".npz" and not path.is_dir():
         raise UsageError(
-            "--agent must be pretrained, velocity-feedback, threshold-follower, rollout, passive, a run folder or a "
+            f"--agent must be pretrained, velocity-feedback, {', '.join(MADE_FROM_ENV)}, passive, a run folder or a "
             f"policy's .npz, got {name!r}"
         )
     policy, _ = stored_agent(path)
@@ -92,7 +102,7 @@ def title_of(name: str, policy: Policy) -> str:
     titles = {
         "passive": "no control",
         "velocity-feedback": "velocity feedback",
-        "threshold-follower": "threshold follower",
+        **{name: name.replace("-", " ") for name in MADE_FROM_ENV},
         "rollout": "rollout of the threshold follower",
     }
     algorithm = str(getattr(policy, "metadata", {}).get("algorithm", "trained"))

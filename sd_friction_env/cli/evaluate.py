@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sd_friction_env import Table
-from sd_friction_env.cli.agents import FOLLOWERS, agent_of, check_fit, stored_agent, velocity_feedback
+from sd_friction_env.cli.agents import MADE_FROM_ENV, agent_of, check_fit, stored_agent, velocity_feedback
 from sd_friction_env.cli.options import (
     Command,
     FailedError,
@@ -28,14 +28,15 @@ from sd_friction_env.cli.options import (
 from sd_friction_env.control.policies import ConstantPolicy, Policy, ZeroPolicy
 from sd_friction_env.learning import classical, evaluation, grids
 
-CONTROLLERS = ("passive", "velocity-feedback", *FOLLOWERS, "constant", "classical")
+CONTROLLERS = ("passive", "velocity-feedback", *MADE_FROM_ENV, "constant", "classical")
 
 TEXT = """\
 Passive always comes first. score: 0 passive, 1 the optimum where one is stored ("-" where none is), over the episodes
 whose optimum is known; suppressed: share of the episodes that end still (amplitude under 5% of passive), without stick,
 at nominal belt speed; both with 95% intervals over the episodes. Amplitude, reduction, stick and belt speed are of the
 last half of the episodes; settling is the mean time of those that settle; residual is the rms action of the last
-quarter. --controller classical stands for all classical controllers that were tuned for the environment."""
+quarter; ms is the wall time of one decision for one environment. --controller classical stands for all classical
+controllers that were tuned for the environment."""
 
 GRID_TEXT = """\
 The episodes of `sd-friction evaluate` for every plant of the grid. --backend and --address say where it runs; the
@@ -51,6 +52,8 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--controller", nargs="+", default=[], choices=CONTROLLERS, help=text)
     parser.add_argument("--gain", type=float, help="of velocity-feedback (default: 1.5 on force, 1 on belt)")
     add_environment(parser)
+    text = "episodes on plants whose alpha, mu_m and belt_speed differ by this share from what controllers know"
+    parser.add_argument("--plant-error", type=float, metavar="SHARE", help=text)
     text = "the first N of the protocol's (default: all 100)"
     parser.add_argument("--episodes", type=int, default=100, metavar="N", help=text)
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the table")
@@ -77,9 +80,9 @@ def _controllers(
         elif name == "velocity-feedback":
             policy, used = velocity_feedback(env_id, env_kwargs, gain)
             made[f"velocity feedback {used:g}"] = policy
-        elif name in FOLLOWERS:
-            follower = FOLLOWERS[name](evaluation.make_env(env_id, env_kwargs))
-            made[f"{name.replace('-', ' ')}, default numbers"] = follower
+        elif name in MADE_FROM_ENV:
+            env = evaluation.make_env(env_id, env_kwargs)
+            made[f"{name.replace('-', ' ')}, default numbers"] = MADE_FROM_ENV[name](env)
     return made
 
 
@@ -117,17 +120,23 @@ def _evaluate(options: argparse.Namespace) -> int:
         for (env_id, kwargs_text), learned in _agents_by_environment(options).items():
             env_kwargs = json.loads(kwargs_text)
             beside = _controllers(options.controller, options.gain, env_id, env_kwargs)
-            passive = evaluation.passive_episodes(env_id, seeds, env_kwargs)
+            plants = None
+            if options.plant_error is not None:
+                env = evaluation.make_env(env_id, env_kwargs)
+                plants = evaluation.plants_off_nominal(env, len(seeds), options.plant_error)
+            passive = evaluation.passive_episodes(env_id, seeds, env_kwargs, plants)
             passive_table = evaluation.metrics(passive, passive)
-            optimal = evaluation.optimal_returns(env_id, seeds, env_kwargs)
+            optimal = None if plants else evaluation.optimal_returns(env_id, seeds, env_kwargs)
             rows = []
             for name, policy in {"passive": ZeroPolicy(), **beside, **learned}.items():
-                table = evaluation.evaluate(policy, env_id, seeds, env_kwargs, passive=passive)
-                rows.append(evaluation.summarise(name, table, passive_table, optimal))
+                table = evaluation.evaluate(policy, env_id, seeds, env_kwargs, passive=passive, options=plants)
+                row = evaluation.summarise(name, table, passive_table, optimal)
+                rows.append(row | {"ms": evaluation.decision_milliseconds(policy, env_id, env_kwargs)})
                 all_episodes.append((env_id, name, table))
             if optimal is not None:
                 rows.append({"controller": "optimum", "return": float(np.nanmean(optimal)), "score": 1.0})
             shown = f" with {kwargs_text}" if env_kwargs else ""
+            shown += f", plants {options.plant_error:.0%} off nominal" if plants else ""
             print(f"\n{env_id}{shown}, {len(seeds)} episodes")
             print(evaluation.format_summary(rows))
             all_rows += [{"env_id": env_id, **row} for row in rows]
@@ -150,7 +159,8 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _add_grid(parser: argparse.ArgumentParser) -> None:
     add_environment(parser, arguments=False)
-    text = f"pretrained (default), velocity-feedback, {', '.join(FOLLOWERS)}, passive, a run folder, or a policy's .npz"
+    names = ", ".join(MADE_FROM_ENV)
+    text = f"pretrained (default), velocity-feedback, {names}, passive, a run folder, or a policy's .npz"
     parser.add_argument("--agent", default="pretrained", help=text)
     text = "a parameter of the plant with its values or ranges from:to:step; several make a grid"
     parser.add_argument("--over", nargs="+", action="append", required=True, metavar=("NAME", "VALUE"), help=text)

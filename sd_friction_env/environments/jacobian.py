@@ -104,6 +104,24 @@ def control_steps(
     return ends.T.reshape(states.shape), rewards.reshape(actions.shape), failures
 
 
+def control_jacobians(
+    plant: kernel.Plant, actuator: kernel.Actuator, states: FloatArray, actions: FloatArray
+) -> FloatArray:
+    """Return the derivatives of (x, v, v_belt, reward) by (x, v, v_belt, action), (..., 4, 4).
+
+    They are exact, the times of events included; NaN where a step cannot be followed.
+
+    Args:
+        plant, actuator, states, actions: as :func:`control_steps` takes them.
+    """
+    n, rows = actions.size, len(kernel.OUTCOMES)
+    starts = np.empty((4, n))
+    starts[:3], starts[3] = states.reshape(-1, 3).T, actions.reshape(-1)
+    outcomes, found, codes = np.empty((n, rows)), np.empty((n, rows, 4)), np.empty((2, n), np.int64)
+    kernel.control_intervals_with_tangents(plant, actuator, starts, None, _NO_CHANGES, outcomes, found, codes)
+    return found[:, :4].reshape(*actions.shape, 4, 4)
+
+
 def step_with_jacobian(
     state: ArrayLike,
     action: ArrayLike,

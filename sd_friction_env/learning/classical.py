@@ -6,7 +6,6 @@ suppressed episodes is stored with it.
 """
 
 import contextlib
-import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -24,25 +23,32 @@ from sd_friction_env import ENVIRONMENT_IDS, SDFrictionEnv
 from sd_friction_env.control.policies import (
     Actions,
     DelayedFeedback,
+    Dither,
     EstimatingFollower,
     FilteredFeedback,
     LinearFeedback,
     ObservingFollower,
     Policy,
     Readings,
+    ScheduledFeedback,
     SlidingMode,
+    SoftBelt,
     State,
+    SuperTwisting,
     ThresholdFollower,
     VelocityFeedback,
 )
+from sd_friction_env.control.policies.feedback import nearest_equilibrium
+from sd_friction_env.environments.jacobian import step_with_jacobian
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.versions import versions
+from sd_friction_env.physics.parameters import OscillatorParameters
 from sd_friction_env.storage import AGENTS, locked, predecessor_hint, read_json, write_json
 
 GAINS_FILE = AGENTS / "classical.json"
 TUNING_SEEDS = evaluation.VALIDATION_SEEDS[:32]
 
-_DIFFERENCE = 1e-5
+_SCHEDULED = 11  # belt speeds of a gain schedule
 _AT_ONCE = 32  # controllers side by side: more are no faster and need more memory
 _AT_BOUND = 0.01  # of a range: a value this close to a bound counts as at it
 
@@ -120,6 +126,29 @@ def _lqr(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
     return LinearFeedback.from_env(env, lqr_gains(env, *(10.0**value for value in values)))
 
 
+def _scheduled_lqr(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    weights = 10.0 ** values[0], 10.0 ** values[1]
+    low, high = env.task.randomise.get("belt_speed", (env.nominal.belt_speed,) * 2)
+    speeds = np.unique(np.linspace(low, high, _SCHEDULED)).tolist()
+    plants = [env.nominal.replace(belt_speed=speed) for speed in speeds]
+    gains = [lqr_gains(env, *weights, plant) for plant in plants]
+    places = [nearest_equilibrium(plant, Readings.from_env(env).x_offset) for plant in plants]
+    return ScheduledFeedback.from_env(env, tuple(speeds), tuple(gains), tuple(places))
+
+
+def _super_twisting(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    return SuperTwisting.from_env(env, *values)
+
+
+def _soft(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    return SoftBelt.from_env(env, *(10.0**value for value in values))
+
+
+def _dither(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    amplitude, period = values
+    return Dither.from_env(env, amplitude, 2.0 * math.pi / (period * env.task.control_interval))
+
+
 def _filtered(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
     return FilteredFeedback.from_env(env, x_gain=values[0], v_gain=values[1], pole=values[2], bias=values[3])
 
@@ -176,9 +205,16 @@ def _slope(env: SDFrictionEnv) -> Range:
 _BIAS = _gain(1.0)
 _LAYER = Range(-5.0, 2.0, low_is="a switch", high_is="hardly any feedback")
 _POLE = Range(0.0, 0.99, low_is="no smoothing")
+_PERIOD = Range(2.0, 200.0, low_is="the fastest that can be held")
 _AMPLITUDE = Range(-1.0, 1.0, low_is="all that the actuator gives", high_is="all that the actuator gives")
 _DELAY = Range(1.0, 100.0, low_is="the shortest delay there is")
 _WEIGHT = Range(-8.0, 8.0)
+_SHARE = Range(0.0, 1.0, low_is="no action", high_is="all that the actuator gives")
+_SOFT = {
+    "log10 inertia": Range(-3.0, 5.0, low_is="no inertia", high_is="a belt that does not yield"),
+    "log10 damping": Range(-5.0, 5.0, low_is="no damper", high_is="a belt that does not yield"),
+    "log10 stiffness": Range(-6.0, 4.0, low_is="no spring", high_is="a belt that does not yield"),
+}
 _FOLLOWS = {
     "log10 gain": Range(-2.0, 4.0, low_is="hardly any feedback", high_is="a switch"),
     # Of the slowest belt speed (the nominal one: 2 in the tiers). At 1, rounding decides whether the mass rides the
@@ -194,6 +230,24 @@ KINDS: dict[str, Kind] = {
     "linear state feedback": Kind(_linear, _linear_ranges),
     "LQR": Kind(_lqr, lambda env: {"log10 weight of x": _WEIGHT, "log10 weight of the action": _WEIGHT}),
     "sliding mode": Kind(_sliding, lambda env: {"slope": _slope(env), "log10 layer": _LAYER, "amplitude": _AMPLITUDE}),
+    "super-twisting": Kind(
+        _super_twisting,
+        lambda env: {
+            "slope": _slope(env),
+            "proportional": _gain(Readings.from_env(env).v_scale ** -0.5),
+            "integral": _gain(1.0),
+        },
+    ),
+    "LQR, gains scheduled by belt speed": Kind(
+        _scheduled_lqr, lambda env: {"log10 weight of x": _WEIGHT, "log10 weight of the action": _WEIGHT}
+    ),
+    "soft belt": Kind(_soft, lambda env: _SOFT, actuator="belt_speed"),
+    "dither": Kind(
+        _dither,
+        lambda env: {"amplitude": _SHARE, "period in control intervals": _PERIOD},
+        needs_velocity=False,
+        everywhere=True,
+    ),
     "delayed displacement feedback": Kind(
         _delayed, lambda env: {"gain": _x_gain(env), "delay": _DELAY}, needs_velocity=False, everywhere=True
     ),
@@ -231,44 +285,44 @@ def kinds_for(env_id: str) -> list[str]:
 # LQR ------------------------------------------------------------------------------------------------------------------
 
 
-def linearised(env: SDFrictionEnv) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return A, shape (k, k), and B, shape (k, 1), of the nominal plant's step about its steady-slip equilibrium.
+def linearised(
+    env: SDFrictionEnv, plant: OscillatorParameters | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return A, shape (k, k), and B, shape (k, 1), of a plant's step about its steady-slip equilibrium.
 
-    The state is what a controller reads (see ``Readings.names``). The matrices are differences of the environment's own
-    step, so that they include the hold over an interval and the belt's inertia.
+    The state is what a controller reads (see ``Readings.names``). The matrices are the exact derivatives of the
+    environment's own step, so that they include the hold over an interval and the belt's inertia.
+
+    Args:
+        env: the environment. plant: None: its nominal plant.
     """
+    plant = env.nominal if plant is None else plant
     readings = Readings.from_env(env)
+    at_rest = nearest_equilibrium(plant, readings.x_offset), 0.0, plant.belt_speed
+    jacobian = step_with_jacobian(at_rest, 0.0, plant, env.task).jacobian
     k = len(readings.names)
-    speed, plant = env.nominal.belt_speed, dataclasses.asdict(env.nominal)
-
-    def step(deviation: NDArray[np.float64], action: float) -> NDArray[np.float64]:
-        start = {"x": readings.x_equilibrium + deviation[0], "v": deviation[1]}
-        env.reset(seed=0, options=start | {"parameters": plant})
-        if k == 3:
-            env.set_state(dataclasses.replace(env.get_state(), v_belt=speed + readings.authority * deviation[2]))
-        _, _, _, _, info = env.step(np.array([action]))
-        end = [info["x"] - readings.x_equilibrium, info["v"], (info["v_belt"] - speed) / readings.authority]
-        return np.array(end[:k])
-
-    h = _DIFFERENCE
-    a = np.stack([(step(h * e, 0.0) - step(-h * e, 0.0)) / (2.0 * h) for e in np.eye(k)], axis=1)
-    # Actions are float32 in use, and float64 here.
-    b = (step(np.zeros(k), h) - step(np.zeros(k), -h)) / (2.0 * h)
-    return a, b[:, None]
+    units = np.array([1.0, 1.0, env.task.belt_authority * plant.belt_speed])[:k]
+    return jacobian[:k, :k] * units / units[:, None], jacobian[:k, 3:4] / units[:, None]
 
 
-def lqr_gains(env: SDFrictionEnv, x_weight: float, action_weight: float) -> tuple[float, ...]:
-    """Return the gains of the linear-quadratic regulator at the nominal plant's steady-slip equilibrium.
+def lqr_gains(
+    env: SDFrictionEnv, x_weight: float, action_weight: float, plant: OscillatorParameters | None = None
+) -> tuple[float, ...]:
+    """Return the gains of the linear-quadratic regulator at a plant's steady-slip equilibrium.
 
     The cost of a step is that of the task, v^2/v_b^2 + action_weight w_effort a^2, and x_weight x^2.
+
+    Args:
+        env: the environment. x_weight, action_weight: of the cost. plant: None: the nominal one.
 
     Raises:
         ValueError: if the sensor does not see the velocity.
     """
     if not Readings.from_env(env).sees_velocity:
         raise ValueError("LQR needs the velocity, and this environment's sensor sees the position only")
-    a, b = linearised(env)
-    q = np.diag([x_weight, 1.0 / env.nominal.belt_speed**2, 0.0][: len(a)])
+    plant = env.nominal if plant is None else plant
+    a, b = linearised(env, plant)
+    q = np.diag([x_weight, 1.0 / plant.belt_speed**2, 0.0][: len(a)])
     r = np.array([[action_weight * max(env.task.w_effort, 1e-6)]])
     p = scipy.linalg.solve_discrete_are(a, b, q, r)
     gains = -np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)

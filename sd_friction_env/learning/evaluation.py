@@ -7,6 +7,7 @@ never samples at their ends.
 import functools
 import json
 import operator
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,7 @@ from sd_friction_env import SDFrictionEnv, SDFrictionVectorEnv, Table
 from sd_friction_env.control.policies import Policy, State, ZeroPolicy
 from sd_friction_env.learning import optimal
 from sd_friction_env.learning.scores import NO_INTERVAL, RESAMPLES, score, score_interval, share_interval
+from sd_friction_env.physics.parameters import checked_number
 
 Array = NDArray[np.float64]
 
@@ -247,22 +249,70 @@ def evaluate(
     env_kwargs: Mapping[str, Any] | None = None,
     *,
     passive: Episodes | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Table:
     """Run one episode per seed and return the table of :func:`metrics`.
 
     Args:
-        policy, env_id, seeds, env_kwargs: as :func:`run_episodes` takes them.
+        policy, env_id, seeds, env_kwargs, options: as :func:`run_episodes` takes them.
         passive: the same episodes without control, if available (otherwise they are run, and cached).
     """
     if passive is None:
-        passive = passive_episodes(env_id, seeds, env_kwargs)
-    return metrics(run_episodes(policy, env_id, seeds, env_kwargs), passive)
+        passive = passive_episodes(env_id, seeds, env_kwargs, options)
+    return metrics(run_episodes(policy, env_id, seeds, env_kwargs, options), passive)
+
+
+def plants_off_nominal(env: SDFrictionEnv, n: int, error: float) -> dict[str, Any]:
+    """Return the reset's options for n episodes whose plants are not the nominal one that controllers know.
+
+    alpha, mu_m and belt_speed each differ from nominal by the share ``error``: the eight combinations of signs in turn.
+
+    Args:
+        env: of the nominal plant. n: number of episodes. error: in [0, 1).
+
+    Raises:
+        TypeError, ValueError: if the error is not such a number, or a plant would not be allowed.
+    """
+    error = checked_number("plant error", error, 0.0, 0.999)
+    plants = []
+    for i in range(n):
+        signs = {name: 1.0 - 2.0 * (i >> bit & 1) for bit, name in enumerate(("alpha", "mu_m", "belt_speed"))}
+        changes = {name: getattr(env.nominal, name) * (1.0 + sign * error) for name, sign in signs.items()}
+        env.nominal.replace(**changes)
+        plants.append(changes)
+    return {"parameters": {name: np.array([plant[name] for plant in plants]) for name in plants[0]}}
+
+
+def decision_milliseconds(
+    policy: Policy, env_id: str, env_kwargs: Mapping[str, Any] | None = None, decisions: int = 20
+) -> float:
+    """Return the wall time in milliseconds of one decision for one environment: the median of several, after a first.
+
+    Args:
+        policy, env_id, env_kwargs: as :func:`run_episodes` takes them. decisions: measured, at least 1.
+    """
+    env = make_env(env_id, env_kwargs)
+    observation, _ = env.reset(seed=VALIDATION_SEEDS[0])
+    state, times = None, []
+    for i in range(decisions + 1):
+        begun = time.perf_counter()
+        action, state = policy.predict(observation, state, i == 0, deterministic=True)
+        times.append(time.perf_counter() - begun)
+        observation, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            break
+    return float(1e3 * np.median(times[1:] or times))
 
 
 def passive_episodes(
-    env_id: str, seeds: Sequence[int] = EVALUATION_SEEDS, env_kwargs: Mapping[str, Any] | None = None
+    env_id: str,
+    seeds: Sequence[int] = EVALUATION_SEEDS,
+    env_kwargs: Mapping[str, Any] | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Episodes:
     """Return the episodes of :func:`run_episodes` without control."""
+    if options is not None:
+        return run_episodes(ZeroPolicy(), env_id, seeds, env_kwargs, options)
     try:
         key = json.dumps(dict(env_kwargs or {}), sort_keys=True)
     except TypeError:  # arguments that are no plain data, such as a reward function
@@ -347,6 +397,7 @@ _FORMATS = {
     "rms_action": "{:.3f}",
     "residual": "{:.4f}",
     "peak_action": "{:.3f}",
+    "ms": "{:.2f}",
 }
 
 

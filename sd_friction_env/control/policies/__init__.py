@@ -9,6 +9,7 @@ All share one method, that of Stable-Baselines3's policies::
 returned. ``episode_start``, shape (n,) or a bool, marks where an episode has just begun and clears the memory there.
 """
 
+from sd_friction_env.control.policies.dynamic import Dither, ScheduledFeedback, SoftBelt, SuperTwisting
 from sd_friction_env.control.policies.feedback import (
     DelayedFeedback,
     Feedback,
@@ -25,18 +26,22 @@ from sd_friction_env.control.policies.follower import (
     rollout_follower,
     threshold_follower,
 )
-from sd_friction_env.control.policies.lookahead import Model, RolloutPolicy
+from sd_friction_env.control.policies.lookahead import LookAhead, Model, RolloutPolicy
 from sd_friction_env.control.policies.network import NetworkPolicy, PolicyFileError, load_policy
+from sd_friction_env.control.policies.planning import GradientPolicy, SamplingPolicy
 from sd_friction_env.control.policies.policy import Actions, ConstantPolicy, Policy, State, ZeroPolicy
 
 __all__ = [
     "Actions",
     "ConstantPolicy",
     "DelayedFeedback",
+    "Dither",
     "EstimatingFollower",
     "Feedback",
     "FilteredFeedback",
+    "GradientPolicy",
     "LinearFeedback",
+    "LookAhead",
     "Model",
     "NetworkPolicy",
     "ObservingFollower",
@@ -44,8 +49,12 @@ __all__ = [
     "PolicyFileError",
     "Readings",
     "RolloutPolicy",
+    "SamplingPolicy",
+    "ScheduledFeedback",
     "SlidingMode",
+    "SoftBelt",
     "State",
+    "SuperTwisting",
     "ThresholdFollower",
     "VelocityFeedback",
     "ZeroPolicy",

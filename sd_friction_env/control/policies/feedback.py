@@ -7,13 +7,18 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env.control.policies.policy import Actions, State, broadcast_starts, checked_memory
+from sd_friction_env.control.policies.policy import Actions, State, broadcast_starts, checked_memory, remembered
 from sd_friction_env.physics.orbits import equilibria
-from sd_friction_env.physics.parameters import checked_number
+from sd_friction_env.physics.parameters import OscillatorParameters, checked_number
 
 _Floats = NDArray[np.float64]
 _Starts = ArrayLike | None
 _GAINS = (-1e9, 1e9)
+
+
+def nearest_equilibrium(parameters: OscillatorParameters, x: float) -> float:
+    """Return the position of the steady-slip equilibrium that is nearest to x; x where there is none."""
+    return min((place.x for place in equilibria(parameters)), key=lambda place: abs(place - x), default=x)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,14 +58,13 @@ class Readings:
         if not authority > 0.0:
             name = "force_limit" if by_force else "belt_authority"
             raise ValueError(f"feedback needs {name} > 0, got {getattr(task, name)!r}")
-        places = [place.x for place in equilibria(nominal)]
         return cls(
             actuator=task.actuator,
             authority=authority,
             x_offset=task.x_offset,
             x_scale=task.x_scale,
             v_scale=task.v_scale,
-            x_equilibrium=min(places, key=lambda x: abs(x - task.x_offset)) if places else task.x_offset,
+            x_equilibrium=nearest_equilibrium(nominal, task.x_offset),
             sees_velocity=task.sensor == "state",
         )
 
@@ -218,9 +222,7 @@ class FilteredFeedback(Feedback):
 
     def _act(self, values: _Floats, state: State, starts: _Starts) -> tuple[_Floats, State]:
         x = values[..., 0]
-        before, estimate = (x, np.zeros_like(x)) if state is None else checked_memory(state, x.shape, x.shape)
-        begun = broadcast_starts(starts, x)
-        before, estimate = np.where(begun, x, before), np.where(begun, 0.0, estimate)
+        before, estimate = remembered(state, starts, x, np.zeros_like(x))
         estimate = self.pole * estimate + (1.0 - self.pole) * (x - before) / self.control_interval
         action = np.clip(self.bias + self.x_gain * x + self.v_gain * estimate, -self.amplitude, self.amplitude)
         return action, (x, estimate)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.control.policies.feedback import Feedback
 from sd_friction_env.control.policies.lookahead import Model, RolloutPolicy
-from sd_friction_env.control.policies.policy import State, broadcast_starts, checked_memory
+from sd_friction_env.control.policies.policy import State, broadcast_starts, checked_memory, remembered
 
 _Floats = NDArray[np.float64]
 
@@ -109,20 +109,36 @@ class EstimatingFollower(ThresholdFollower):
 
     def _act(self, values: _Floats, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
         v = values[..., 1]
-        least = _REPEATS * self.belt_speed
-        ratio = v / np.maximum(1.0 + self.belt_authority * values[..., 2], _REPEATS)
-        before, estimate, stuck = np.full_like(v, np.inf), np.full_like(v, least), np.zeros(v.shape, bool)
-        if state is not None:
-            begun = broadcast_starts(starts, v)
-            memory = checked_memory(state, v.shape, v.shape, v.shape)
-            pairs = zip((before, estimate, stuck), memory, strict=True)
-            before, estimate, stuck = (np.where(begun, new, old) for new, old in pairs)
-        sticks = (np.abs(ratio - before) <= least) & (ratio > _AT_REST * self.belt_speed)
-        stuck = stuck | sticks
-        if not self.waits:
-            estimate = np.where(stuck, estimate, np.maximum(estimate, ratio))
-        estimate = np.where(sticks, ratio, estimate)
-        return self.follow(v, estimate), (ratio, estimate, stuck)
+        relative_speed = 1.0 + self.belt_authority * values[..., 2]
+        estimate, memory = estimate_belt_speed(v, relative_speed, self.belt_speed, state, starts, waits=self.waits)
+        return self.follow(v, estimate), memory
+
+
+def estimate_belt_speed(
+    v: _Floats,
+    relative_speed: _Floats | float,
+    scale: float,
+    state: State,
+    starts: ArrayLike | None,
+    *,
+    waits: bool = False,
+) -> tuple[_Floats, State]:
+    """Return estimates (...) of nominal belt speeds as :class:`EstimatingFollower` makes them, and the memory.
+
+    Args:
+        v: velocities (...). relative_speed: of the belt, v_belt over the nominal belt speed.
+        scale: the nominal plant's belt speed. state, starts: as ``predict`` takes them. waits: as the class has it.
+    """
+    least = _REPEATS * scale
+    ratio = v / np.maximum(relative_speed, _REPEATS)
+    fresh = np.full_like(v, np.inf), np.full_like(v, least), np.zeros(v.shape, bool)
+    before, estimate, stuck = remembered(state, starts, *fresh)
+    sticks = (np.abs(ratio - before) <= least) & (ratio > _AT_REST * scale)
+    stuck = stuck | sticks
+    if not waits:
+        estimate = np.where(stuck, estimate, np.maximum(estimate, ratio))
+    estimate = np.where(sticks, ratio, estimate)
+    return estimate, (ratio, estimate, stuck)
 
 
 @dataclass(frozen=True)

@@ -78,3 +78,19 @@ def broadcast_starts(starts: ArrayLike | None, like: NDArray[np.float64]) -> NDA
     """Return where an episode has just begun, in the shape of ``like``."""
     begun = np.asarray(False if starts is None else starts, dtype=bool)
     return np.broadcast_to(begun.reshape(()) if like.ndim == 0 and begun.size == 1 else begun, like.shape)
+
+
+def remembered(state: State, starts: ArrayLike | None, *fresh: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """Return a policy's memory, the fresh values where there is none or an episode has just begun.
+
+    Args:
+        state, starts: as ``predict`` takes them. fresh: of each part, all of one shape.
+
+    Raises:
+        ValueError: as :func:`checked_memory`.
+    """
+    if state is None:
+        return fresh
+    begun = broadcast_starts(starts, fresh[0])
+    memory = checked_memory(state, *(new.shape for new in fresh))
+    return tuple(np.where(begun, new, old) for new, old in zip(fresh, memory, strict=True))

@@ -3,18 +3,20 @@
 import functools
 import json
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env.control.policies import PolicyFileError, Readings, State
+from sd_friction_env.control.policies import Feedback, PolicyFileError, Readings, State
+from sd_friction_env.control.policies.planning import base_controller
 from sd_friction_env.environments.task import Task
 from sd_friction_env.learning.optimal.grid import Grid, ValueFunction
 from sd_friction_env.learning.optimal.problem import TASKS, Array, Problem, make_bare_env, step_plant
-from sd_friction_env.learning.optimal.search import look_ahead
+from sd_friction_env.learning.optimal.search import deeper, look_ahead
 from sd_friction_env.learning.optimal.stored import (
     OPTIMUM_DIRECTORY,
     bare_id,
@@ -23,7 +25,7 @@ from sd_friction_env.learning.optimal.stored import (
     fingerprint,
     value_path,
 )
-from sd_friction_env.physics.parameters import OscillatorParameters
+from sd_friction_env.physics.parameters import OscillatorParameters, checked_count, checked_number
 from sd_friction_env.storage import (
     load_arrays,
     parse_json,
@@ -34,19 +36,23 @@ from sd_friction_env.storage import (
 
 @dataclass(frozen=True, eq=False)
 class OptimalPolicy:
-    """A controller that looks one control interval ahead on the nominal plant and takes the best action.
+    """A controller that looks a few control intervals ahead on the nominal plant and takes the best action.
 
-    Best is the sum of the reward and the value of the next state. The policy has the methods of all controllers (see
+    Best is the sum of the rewards and the value of the last state. The policy has the methods of all controllers (see
     :mod:`policies`) and must observe the velocity. States outside the grid count as the nearest on its border.
 
     Attributes:
         task, parameters: of the environment the value was computed for.
         readings: conversion of its observations to x, v and v_belt.
         grid: of the value function. values: best return still to come from each node, shape (prod(sizes),).
-        count: evenly spaced actions tried, three times, each time closer to the best.
+        count: evenly spaced first actions tried, three times, each time closer to the best.
+        depth: control intervals looked ahead, in [1, 3]. branches: actions tried in each but the first, in [2, 1000].
+        base: None, or the controller without memory that acts within ``radius`` of rest, in the plane of x and v: there
+            the grid is too coarse, and its interpolation may hold the belt beside its nominal speed (dual-mode control:
+            H. Michalska and D. Q. Mayne, IEEE Trans. Autom. Control 38 (1993) 1623).
 
     Raises:
-        ValueError: if there is not one finite value for each node.
+        TypeError, ValueError: if there is not one finite value for each node, or a number is not as said.
     """
 
     task: Task
@@ -55,8 +61,15 @@ class OptimalPolicy:
     grid: Grid
     values: Array
     count: int = 41
+    depth: int = 1
+    branches: int = 11
+    base: Feedback | None = None
+    radius: float = 0.05
 
     def __post_init__(self) -> None:
+        for name, low, high in (("count", 2, 10_000), ("depth", 1, 3), ("branches", 2, 1000)):
+            object.__setattr__(self, name, checked_count(name, getattr(self, name), low, high))
+        object.__setattr__(self, "radius", checked_number("radius", self.radius, 0.0, 1e9))
         nodes = math.prod(self.grid.sizes)
         if self.values.shape != (nodes,) or not np.isfinite(self.values).all():
             raise ValueError(f"values must be {nodes} finite numbers, got shape {self.values.shape}")
@@ -98,6 +111,25 @@ class OptimalPolicy:
         check_fingerprint(stored, env_id, [])
         return policy
 
+    @classmethod
+    def from_env(cls, env: Any, depth: int = 2) -> Self:
+        """Return the stored policy of an environment as registered, with its base controller near rest.
+
+        Args:
+            env: wrapped or not. depth: control intervals looked ahead, in [1, 3].
+
+        Raises:
+            ValueError: if no value function is stored for its id, task and nominal plant. Others: as :meth:`load`.
+        """
+        bare = env.unwrapped
+        try:
+            policy = cls.load(bare.spec.id)
+        except FileNotFoundError as error:
+            raise ValueError(str(error)) from None
+        if (policy.task, policy.parameters) != (bare.task, bare.nominal):
+            raise ValueError(f"the value function of {bare.spec.id} is stored for its own arguments: leave others out")
+        return replace(policy, depth=depth, base=base_controller(env))
+
     def actions(self, states: Array) -> Array:
         """Return the best actions in states (x, v, v_belt) of shape (n, 3), shape (n,)."""
         lows, highs = self.grid.lows, self.grid.highs
@@ -107,7 +139,10 @@ class OptimalPolicy:
         # The observation of a stuck mass is rounded: put it back on the belt.
         v = np.where(np.abs(v - v_belt) < 1e-7, v_belt, v)
         step = functools.partial(step_plant, self.task, self.parameters)
-        return look_ahead(step, self.grid, self.values, np.stack([x, v, v_belt], axis=1), self.count)
+        value: Callable[[Array], Array] = functools.partial(self.grid.interpolate, self.values)
+        for _ in range(self.depth - 1):
+            value = functools.partial(deeper, step, value, count=self.branches)
+        return look_ahead(step, value, np.stack([x, v, v_belt], axis=1), self.count)
 
     def predict(
         self,
@@ -129,8 +164,11 @@ class OptimalPolicy:
         states[..., 1] = values[..., 1]
         if self.task.actuator == "belt_speed":
             states[..., 2] += self.readings.authority * values[..., 2]
-        actions = self.actions(states.reshape(-1, 3))
-        return actions.astype(np.float32).reshape(*values.shape[:-1], 1), None
+        actions = self.actions(states.reshape(-1, 3)).reshape(values.shape[:-1])
+        if self.base is not None:
+            near = values[..., 0] ** 2 + values[..., 1] ** 2 <= self.radius**2
+            actions = np.where(near, self.base.predict(observation)[0][..., 0], actions)
+        return actions.astype(np.float32)[..., None], None
 
 
 def save_value(problem: Problem, value: ValueFunction, directory: Path = OPTIMUM_DIRECTORY) -> Path:

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sd_friction_env import kernel
+from sd_friction_env.control.shooting import rollout
 from sd_friction_env.environments import ids
 from sd_friction_env.environments.ids import environment_id
-from sd_friction_env.environments.jacobian import control_steps, step_with_jacobian
+from sd_friction_env.environments.jacobian import control_jacobians, control_steps
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.environments.task import Task, drifted
 from sd_friction_env.physics.parameters import OscillatorParameters
@@ -124,14 +125,9 @@ class Problem:
             part = self._part(rows)
             for t in range(actions.shape[1]) if self.changes else (0,):
                 here = (part, t) if self.changes else part
-                step = step_with_jacobian(
-                    states[here].reshape(-1, 3),
-                    actions[here].reshape(-1),
-                    self.parameters_at(t, *plant),
-                    self.task,
-                    time=t * self.task.control_interval,
-                )
-                found[here] = step.jacobian[:, :4].reshape(*actions[here].shape, 4, 4)
+                parameters = self.parameters_at(t, *plant)
+                now = kernel.at_time(parameters.plant, t * self.task.control_interval)
+                found[here] = control_jacobians(now, self.task.actuator_of(parameters), states[here], actions[here])
         return found
 
     def _part(self, rows: NDArray[np.int64]) -> Any:
@@ -143,12 +139,7 @@ class Problem:
         Args:
             actions: one sequence per start, shape (n, steps).
         """
-        states = np.empty((len(self.starts), self.steps + 1, 3))
-        rewards = np.empty(actions.shape)
-        states[:, 0] = self.starts
-        for t in range(self.steps):
-            states[:, t + 1], rewards[:, t] = self.step(states[:, t], actions[:, t], t)
-        return states, rewards
+        return rollout(self, self.starts, actions)
 
     def returns(self, actions: Array) -> Array:
         """Return the undiscounted sum of rewards of each sequence, shape (n,)."""

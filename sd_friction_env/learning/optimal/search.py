@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sd_friction_env.learning.optimal.grid import Grid, ValueFunction
+from sd_friction_env.learning.optimal.grid import ValueFunction
 from sd_friction_env.learning.optimal.problem import Array, Problem, Progress, silent
 
 
@@ -33,25 +33,46 @@ def greedy_actions(
             sequences[:, t] = prefix[:, t]
         else:
             sequences[:, t] = look_ahead(
-                functools.partial(problem.step, t=t), value.grid, value.after_first, states, count
+                functools.partial(problem.step, t=t),
+                functools.partial(value.grid.interpolate, value.after_first),
+                states,
+                count,
             )
         states, _ = problem.step(states, sequences[:, t], t)
     return sequences
 
 
 def look_ahead(
-    step: Callable[[Array, Array], tuple[Array, Array]], grid: Grid, values: Array, states: Array, count: int
+    step: Callable[[Array, Array], tuple[Array, Array]], value: Callable[[Array], Array], states: Array, count: int
 ) -> Array:
-    """Return the actions, shape (n,), that are best one step ahead in states of shape (n, 3)."""
+    """Return the actions, shape (n,), that are best one step ahead in states of shape (n, 3).
+
+    Args:
+        step: of the plant. value: of states (..., 3), shape (...). count: actions tried at a time.
+    """
     n = len(states)
     centre, width = np.zeros(n), 1.0
     for _ in range(3):
         tried = np.clip(centre[:, None] + width * np.linspace(-1.0, 1.0, count), -1.0, 1.0)
         ends, rewards = step(np.repeat(states[:, None], count, axis=1), tried)
-        best = np.argmax(rewards + grid.interpolate(values, ends), axis=1)
+        best = np.argmax(rewards + value(ends), axis=1)
         centre = tried[np.arange(n), best]
         width *= 4.0 / count
     return centre
+
+
+def deeper(
+    step: Callable[[Array, Array], tuple[Array, Array]], value: Callable[[Array], Array], states: Array, count: int
+) -> Array:
+    """Return what states (..., 3) are worth, shape (...), looking one step further than a value function does.
+
+    Args:
+        step, value: as :func:`look_ahead` takes them. count: evenly spaced actions tried.
+    """
+    tried = np.broadcast_to(np.linspace(-1.0, 1.0, count), (*states.shape[:-1], count))
+    ends, rewards = step(np.repeat(states[..., None, :], count, axis=-2), tried)
+    worth: Array = (rewards + value(ends)).max(axis=-1)
+    return worth
 
 
 def beam_actions(

@@ -32,10 +32,11 @@ CONTROLLERS = ("passive", "velocity-feedback", *FOLLOWERS, "constant", "classica
 
 TEXT = """\
 Passive always comes first. score: 0 passive, 1 the optimum where one is stored ("-" where none is), over the episodes
-whose optimum is known; suppressed: share of the episodes that end still (amplitude under 5% of passive), without stick,
-at nominal belt speed; both with 95% intervals over the episodes. Amplitude, reduction, stick and belt speed are of the
-last half of the episodes; settling is the mean time of those that settle; residual is the rms action of the last
-quarter. --controller classical stands for all classical controllers that were tuned for the environment."""
+whose optimum is known; credited: the same with credit for suppressed episodes only, the others counted as passive;
+suppressed: share of the episodes that end still (amplitude under 5% of passive), without stick, at nominal belt speed.
+Score and suppressed have 95% intervals over the episodes. Amplitude, reduction, stick and belt speed are of the last
+half of the episodes; settling is the mean time of those that settle; residual is the rms action of the last quarter.
+--controller classical stands for all classical controllers that were tuned for the environment."""
 
 GRID_TEXT = """\
 The episodes of `sd-friction evaluate` for every plant of the grid. --backend and --address say where it runs; the

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sd_friction_env import Table
-from sd_friction_env.cli.agents import FOLLOWERS, agent_of, check_fit, stored_agent, velocity_feedback
+from sd_friction_env.cli.agents import AGENTS_TEXT, FOLLOWERS, agent_of, check_fit, stored_agent, velocity_feedback
 from sd_friction_env.cli.options import (
     Command,
     FailedError,
@@ -58,7 +58,8 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes-csv", type=Path, metavar="FILE", help="write every episode of every controller")
 
 
-def _check_episodes(options: argparse.Namespace) -> None:
+def check_episodes(options: argparse.Namespace) -> None:
+    """Check --episodes against the protocol's number."""
     if not 1 <= options.episodes <= len(evaluation.EVALUATION_SEEDS):
         raise UsageError(f"--episodes must be in [1, {len(evaluation.EVALUATION_SEEDS)}], got {options.episodes}")
 
@@ -109,7 +110,7 @@ def _agents_by_environment(options: argparse.Namespace) -> dict[tuple[str, str],
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    _check_episodes(options)
+    check_episodes(options)
     check_file("--csv", options.csv)
     check_file("--episodes-csv", options.episodes_csv)
     seeds = evaluation.EVALUATION_SEEDS[: options.episodes]
@@ -151,7 +152,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _add_grid(parser: argparse.ArgumentParser) -> None:
     add_environment(parser, arguments=False)
-    text = f"pretrained (default), velocity-feedback, {', '.join(FOLLOWERS)}, passive, a run folder, or a policy's .npz"
+    text = f"{AGENTS_TEXT} (default: pretrained)"
     parser.add_argument("--agent", default="pretrained", help=text)
     text = "a parameter of the plant with its values or ranges from:to:step; several make a grid"
     parser.add_argument("--over", nargs="+", action="append", required=True, metavar=("NAME", "VALUE"), help=text)
@@ -161,7 +162,7 @@ def _add_grid(parser: argparse.ArgumentParser) -> None:
 
 
 def _grid(options: argparse.Namespace) -> int:
-    _check_episodes(options)
+    check_episodes(options)
     check_file("--out", options.out, ".csv")
     over: dict[str, list[float]] = {}
     for name, *texts in options.over:

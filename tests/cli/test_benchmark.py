@@ -1,7 +1,10 @@
 """``sd-friction benchmark``: a stranger's controller entered, verified and ranked; nothing is lost or overwritten."""
 
 import json
+import re
+import shlex
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +12,7 @@ from sd_friction_env.cli.main import main
 from sd_friction_env.learning import protocol
 from sd_friction_env.storage import AGENTS, read_json
 
+ROOT = Path(__file__).resolve().parents[2]
 POLICY = '''
 import numpy as np
 
@@ -78,6 +82,20 @@ def test_a_strangers_policy_is_run_verified_and_ranked(mine, tmp_path, capsys):
     assert second.startswith("not told,SDFriction/Force-v0,mine,-,0.9")
     assert main(["benchmark", "table", "a.json", "b.json"]) == 0
     assert capsys.readouterr().out.count("###") == 2
+
+
+def test_the_commands_of_the_page_run_on_the_policy_that_it_shows(tmp_path, monkeypatch, capsys):
+    page = (ROOT / "docs" / "howto" / "benchmark.md").read_text(encoding="utf-8")
+    (tmp_path / "mine.py").write_text(page.partition("```python\n")[2].partition("```")[0])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    entries = " ".join(map(str, (AGENTS / "entries").glob("*.json")))
+    commands = re.findall("^sd-friction (benchmark .*mine.*)$", page, re.M)
+    assert [command.split()[1] for command in commands] == ["run", "verify", "table", "off-nominal"]
+    for command in commands[:3]:
+        assert main(shlex.split(command.replace("agents/entries/*.json", entries))) == 0
+    sys.modules.pop("mine")
+    assert "| SDFriction/Force-v0 | my feedback | - | 0.9" in capsys.readouterr().out
 
 
 def test_an_interrupted_run_goes_on_where_it_was(mine, monkeypatch, capsys):

@@ -53,6 +53,16 @@ def test_an_entry_holds_the_episodes_and_is_read_as_it_was_written(path, made):
         assert protocol.differences(protocol.read_entry(path), env_id, feedback(env_id)) == []
 
 
+def test_environments_after_the_first_are_stored_as_what_differs_from_it(entry, tmp_path):
+    entry["environments"][BELT] = protocol.measure(ZeroPolicy(), "passive", BELT)
+    protocol.write_entry(entry, tmp_path / "three.json")
+    stored = read_json(tmp_path / "three.json")["environments"]
+    assert list(stored[HIDDEN]["configuration"]["task"]) == ["randomise"]
+    assert stored[BELT]["configuration"]["parameters"] == {}
+    assert "randomise" not in stored[BELT]["configuration"]["task"]  # as in the first
+    assert protocol.read_entry(tmp_path / "three.json") == entry
+
+
 def test_an_entry_changed_by_hand_differs_from_its_digest(path):
     text = path.read_text()
     for old, new in (
@@ -242,6 +252,8 @@ def test_the_table_has_two_blocks_and_the_best_first(made):
     assert not_told.count("| feedback | - |") == 2
     assert "(32 starts)" in not_told
     assert protocol.leaderboard([made], [BELT]) == []
+    slow = changed_entry(made, "slow", "", 2.0, suppressed="0")
+    assert [row["entry"] for row in protocol.leaderboard([made, slow], [FORCE])] == ["slow", "feedback"]
 
 
 def test_without_an_optimum_the_share_suppressed_ranks_and_the_score_is_a_dash(made, monkeypatch):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sd_friction_env import OscillatorParameters, limit_cycle
+from sd_friction_env import OscillatorParameters, limit_cycle, load_pretrained
 from sd_friction_env.control.policies import EstimatingFollower, ThresholdFollower, ZeroPolicy
 from sd_friction_env.learning import evaluation, off_nominal
 
@@ -59,3 +59,16 @@ def test_each_controller_meets_each_plant_with_the_scales_of_the_nominal_one():
     assert lines[0] == "| plant | passive | told | sees | not told |"
     assert lines[2].startswith("| alpha 0.7 | 0%, -4")
     assert lines[-1] == "| all suppressed | 0 of 2 | 1 of 2 | 0 of 2 | 2 of 2 |"
+
+
+def test_under_coulombs_law_only_the_damping_ends_the_vibration():
+    # Its friction does not depend on the sliding speed: while the mass slips, the belt has no effect (docs/control.md).
+    env, seeds = evaluation.make_env(BELT), evaluation.VALIDATION_SEEDS[:20]
+    options = {"parameters": off_nominal.PLANTS["Coulomb friction, 0.3 and 0.05"]}
+    for policy in (EstimatingFollower.from_env(env), load_pretrained("SDFriction/BeltSpeedRandomised-v0")):
+        for steps, share in ((500, 0.0), (1000, 1.0)):
+            how = {"env_kwargs": {"episode_steps": steps}, "options": options}
+            passive, controlled = (evaluation.run_episodes(acts, BELT, seeds, **how) for acts in (ZeroPolicy(), policy))
+            table = evaluation.metrics(controlled, passive)
+            assert table["suppressed"].mean() == share
+            assert table["late_stick_fraction"].max() == 0.0

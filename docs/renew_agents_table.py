@@ -8,7 +8,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from sd_friction_env import ENVIRONMENT_IDS, load_pretrained
+from sd_friction_env import load_pretrained
+from sd_friction_env.environments.ids import SOLVED_IDS
 
 AGENTS = Path(__file__).resolve().parent.parent / "agents"
 PAGE = AGENTS / "README.md"
@@ -27,7 +28,7 @@ def row(*cells: object) -> str:
 def shipped() -> str:
     """Return the table of the agents that ``load_pretrained`` loads."""
     table = "| environment | run | mean return | score | suppressed |\n|---|---|---|---|---|\n"
-    for env_id in ENVIRONMENT_IDS:
+    for env_id in SOLVED_IDS:
         metadata = load_pretrained(env_id).metadata
         result, task = metadata["evaluation"], metadata["run"].partition("-")[0]
         reached, passive = result["mean_return"], result["mean_passive_return"]

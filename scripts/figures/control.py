@@ -34,7 +34,7 @@ def compute() -> Table:
     for task, env_id in TASKS.items():
         policy = OptimalPolicy.load(env_id)
         start = np.array([[*policy.task.cycle_state(plant, PHASE), plant.belt_speed]])
-        problem = Problem(env_id, policy.task, (plant,), start)
+        problem = Problem(env_id, policy.task, (plant,), start, ((),))
         round_once = int(np.ceil(period / policy.task.control_interval))
         for motion, steps in (("passive", round_once), ("controlled", PATH_STEPS)):
             states, rows = start, []

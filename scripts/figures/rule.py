@@ -48,7 +48,7 @@ def compute() -> Table:
     plant = OscillatorParameters()
     task = make_bare_env(ENV_ID).task
     start = np.array([[*task.cycle_state(plant, PHASE), plant.belt_speed]])
-    problem = Problem(ENV_ID, task, (plant,), start)
+    problem = Problem(ENV_ID, task, (plant,), start, ((),))
     parts = []
     for name, controller in controllers().items():
         states, rows = start, []

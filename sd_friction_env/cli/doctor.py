@@ -15,6 +15,7 @@ import sd_friction_env
 from sd_friction_env import kernel
 from sd_friction_env.control.policies import PolicyFileError
 from sd_friction_env.control.pretrained import load_pretrained
+from sd_friction_env.environments.ids import SOLVED_IDS
 from sd_friction_env.kernel.compilation import NO_FOLDER
 from sd_friction_env.physics.orbits import limit_cycle
 from sd_friction_env.physics.parameters import OscillatorParameters
@@ -58,7 +59,7 @@ def examine() -> dict[str, Any]:
     or what is wrong), ``hyperparameters``, and ``works``: whether all that is needed without extras does.
     """
     kernel_findings = _kernel()
-    agents = {env_id: _agent_fault(env_id) for env_id in sd_friction_env.ENVIRONMENT_IDS}
+    agents = {env_id: _agent_fault(env_id) for env_id in SOLVED_IDS}
     return {
         "versions": versions(),
         "kernel": kernel_findings,

@@ -13,16 +13,17 @@ from sd_friction_env.cli.options import Command, FailedError, UsageError, comman
 from sd_friction_env.learning import optimal
 from sd_friction_env.learning.evaluation import EVALUATION_SEEDS, evaluate
 
-_IDS = {"nominal": optimal.TASKS, "randomised": optimal.RANDOMISED}
+_OPEN = {tier: optimal.OPEN[tier] for tier in ("blind-hard", "drifting", "excited")}
+_IDS = {"nominal": optimal.TASKS, "randomised": optimal.RANDOMISED} | _OPEN
 GRIDS = {
     ("force", "nominal"): ["121x101", "241x201", "481x401"],
     ("belt", "nominal"): ["101x81x9", "201x161x17", "61x401x17", "101x241x33"],
     ("force", "randomised"): ["121x101", "201x161"],
-    ("belt", "randomised"): ["101x81x9", "61x161x17"],
+    **{("belt", tier): ["101x81x9", "61x161x17"] for tier in ("randomised", *_OPEN)},
 }
 QUICK_GRIDS = {"force": ["61x51"], "belt": ["41x41x9"]}
 POLICY_GRIDS = {"force": "241x201", "belt": "61x241x17"}
-DRAWS = {"nominal": len(EVALUATION_SEEDS), "randomised": 32}
+DRAWS = {tier: len(EVALUATION_SEEDS) if tier == "nominal" else 32 for tier in _IDS}
 
 
 def grid_sizes(text: str) -> tuple[int, ...]:
@@ -35,7 +36,8 @@ def grid_sizes(text: str) -> tuple[int, ...]:
 
 TEXT = """\
 Prints the mean return of every stage beside the value functions' own estimates. On the randomised tier every episode
-has a plant of its own, and the optimum knows it (an upper bound). The sensed tier has the nominal optimum. --quick
+has a plant of its own, and the optimum knows it (an upper bound). The sensed tier has the nominal optimum, the tiers
+blind and blind-late that of the randomised one. Where plants change, a grid is that of the plant at the start. --quick
 takes one small grid and few starts, to see that it works, and stores nothing unless --out says where. --show prints
 the stored study and computes nothing. --policy stores a value function for OptimalPolicy. Ctrl-C stops; nothing is then
 stored."""
@@ -44,12 +46,14 @@ stored."""
 def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", choices=sorted(optimal.TASKS), required=True)
     parser.add_argument("--tier", choices=_IDS, default="nominal")
-    parser.add_argument("--draws", type=int, help="how many of the 100 evaluation seeds (default: 100; randomised: 32)")
+    parser.add_argument(
+        "--draws", type=int, help="how many of the 100 evaluation seeds (default: 100; other tiers: 32)"
+    )
     parser.add_argument(
         "--grid", type=grid_sizes, action="append", help="nodes along x, v_rel[, v_belt]; may be repeated"
     )
     parser.add_argument("--beam", type=int, default=100, help="width of the beam searches; 0 for none")
-    parser.add_argument("--rounds", type=int, help="rounds of exchange between starts (default: 4; randomised: 1)")
+    parser.add_argument("--rounds", type=int, help="rounds of exchange between starts (default: 4; other tiers: 1)")
     parser.add_argument("--improve", action="store_true", help="start from the stored sequences as well")
     parser.add_argument("--quick", action="store_true", help="one small grid, 10 starts, nothing stored by default")
     parser.add_argument("--show", action="store_true", help="print the stored study, and compute nothing")
@@ -69,6 +73,8 @@ def _complete(options: argparse.Namespace) -> None:
         options.draws = 10 if quick else DRAWS[tier]
     if not 1 <= options.draws <= len(EVALUATION_SEEDS):
         raise UsageError(f"--draws must be in [1, {len(EVALUATION_SEEDS)}], got {options.draws}")
+    if task not in _IDS[tier]:
+        raise UsageError(f"--tier {tier} is a tier of --task {', '.join(_IDS[tier])}, not of --task {task}")
     if options.grid is None:
         texts = [POLICY_GRIDS[task]] if options.policy else QUICK_GRIDS[task] if quick else GRIDS[task, tier]
         options.grid = [grid_sizes(text) for text in texts]
@@ -80,7 +86,7 @@ def _complete(options: argparse.Namespace) -> None:
     if options.policy and len(options.grid) != 1:
         raise UsageError(f"--policy takes one --grid, got {len(options.grid)}")
     if options.rounds is None:
-        options.rounds = 1 if quick or tier == "randomised" else 4
+        options.rounds = 1 if quick or tier != "nominal" else 4
     for name, largest in (("beam", 10_000), ("rounds", 100)):
         if not 0 <= getattr(options, name) <= largest:
             raise UsageError(f"--{name} must be in [0, {largest}], got {getattr(options, name)}")

@@ -19,7 +19,7 @@ import numpy as np
 
 import sd_friction_env
 from sd_friction_env import ENVIRONMENT_IDS, Table
-from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
+from sd_friction_env.environments.ids import OPEN_TIERS, TASKS, TIERS, environment_id
 from sd_friction_env.physics import sweeps
 from sd_friction_env.physics.laws import friction_table
 from sd_friction_env.physics.parameters import FIELDS, FRICTIONS, GEOMETRIES, RANGES, OscillatorParameters
@@ -82,7 +82,7 @@ class Parser(argparse.ArgumentParser):
 def add_environment(parser: argparse._ActionsContainer, *, arguments: bool = True) -> None:
     """Add the options that name an environment: read them with :func:`environment_of`."""
     parser.add_argument("--task", choices=TASKS, help="actuator: a force on the mass, or the belt's speed")
-    parser.add_argument("--tier", choices=TIERS, help="what is hidden (default: nominal)")
+    parser.add_argument("--tier", choices=(*TIERS, *OPEN_TIERS), help="what is hidden (default: nominal)")
     parser.add_argument("--env-id", metavar="ID", help=f"instead of --task and --tier: {', '.join(ENVIRONMENT_IDS)}")
     if arguments:
         text = "argument of the environment, the value in YAML, such as w_effort=0.2; may be repeated"

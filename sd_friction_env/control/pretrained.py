@@ -98,7 +98,7 @@ def load_pretrained(env_id: str) -> NetworkPolicy:
     Its ``metadata`` record the training and the score.
 
     Args:
-        env_id: one of ``ENVIRONMENT_IDS``, with its default arguments.
+        env_id: that of a task and a tier that is not open, with its default arguments.
 
     Raises:
         ValueError: if the package has no agent for it.

@@ -103,6 +103,7 @@ class Episodes:
         self._past = np.zeros((task.sensor_delay + 1 if task.sensor_delay else 0, 2, n))
         self._shown = np.zeros((n, len(task.shown)))
         self._own = np.zeros(n, np.bool_)  # which have other parameters than the nominal ones
+        self._drift_ends = np.zeros((len(task.drift), n))
         self.observations = np.zeros((n, task.observation_size), np.float32)
         # Each thread steps a share; all shares but the last are made of whole blocks.
         shares = max(1, min(threads, n // _ENVS_WORTH_A_THREAD))
@@ -179,7 +180,7 @@ class Episodes:
         counts = np.zeros((kernel.COUNT_ROWS, len(draft.which)), np.int64)
         counts[kernel.COUNT_KEY], counts[kernel.COUNT_EPISODE] = draft.keys, draft.episodes
         kernel.blank_episodes(state, counts, np.arange(len(draft.which)))
-        own = (laws != 0) | (numbers != self._plants.nominal_column).any(axis=0)
+        own = (laws != 0) | (numbers != self._plants.nominal_column).any(axis=0) | bool(self._task.drift)
         starts = Starts(draft, kinds, state, counts, own)
         self._place(starts)
         return starts
@@ -237,6 +238,8 @@ class Episodes:
         self.state[: len(starts.state), here] = starts.state
         self.counts[:, here] = starts.counts
         self._own[here] = starts.own
+        for row, ends in zip(self._drift_ends, self._task.drift_ends(draft.keys, draft.episodes).values(), strict=True):
+            row[here] = ends
         one_plant = not self._own.any()
         if one_plant and not self._task_codes[kernel.TASK_ONE_PLANT]:
             for work in self._works:
@@ -306,6 +309,11 @@ class Episodes:
 
     def advance(self, actions: FloatArray, rows: IntegerArray, out: Buffers) -> int:
         """Step all environments with actions (num_envs,) and report ``rows``; return how many episodes ended."""
+        if self._task.drift:
+            steps = self.counts[kernel.COUNT_STEPS, : self.num_envs]
+            numbers = self._plants.drift(self._numbers, self._drift_ends, steps)
+            for row, columns, values in self._plants.leaves(self._kinds, numbers, self._laws):
+                self.state[kernel.STATE_PLANT + row, columns] = values
         if len(self._groups) > 1:
             return sum(self._advance_group(group, actions, rows, out) for group in self._groups)
         group = self._groups[0]

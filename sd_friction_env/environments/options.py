@@ -47,10 +47,20 @@ def check_belt(parameters: OscillatorParameters) -> None:
 
 def check_ranges(task: Task, nominal: OscillatorParameters) -> None:
     """Raise ValueError if an episode could draw parameters that are not legal."""
-    corner = {name: low for name, (low, _) in task.randomise.items()}
-    for name in {"mu_m", "mu_k"} & corner.keys():
-        corner[name] = task.randomise[name][1]  # the largest, with the smallest mu_s
+    corner: dict[str, float] = {}
+    for name, (low, high) in (*task.randomise.items(), *task.drift.items()):
+        # The largest mu_m and mu_k with the smallest mu_s.
+        corner[name] = (
+            max(corner.get(name, high), high) if name in ("mu_m", "mu_k") else min(corner.get(name, low), low)
+        )
     check_belt(nominal.replace(**corner))
+    check_drift(task, nominal)
+
+
+def check_drift(task: Task, parameters: OscillatorParameters) -> None:
+    """Raise ValueError if a parameter cannot drift from its value."""
+    if "alpha" in task.drift and parameters.alpha == 0.0:
+        raise ValueError("alpha = 0 (the discontinuous limit) cannot drift: start at a positive alpha")
 
 
 # Options of reset -----------------------------------------------------------------------------------------------------
@@ -95,6 +105,7 @@ def apply_options(
     if "parameters" in options:
         parameters = parameters.replace(**options["parameters"])
         check_belt(parameters)
+        check_drift(task, parameters)
     if "x" in options:
         return parameters, (options["x"], options.get("v", parameters.first_belt_speed))
     if "phase" in options:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env import kernel
 from sd_friction_env.environments.info import law_codes
-from sd_friction_env.environments.task import FloatArray, IntegerArray, Task
+from sd_friction_env.environments.task import FloatArray, IntegerArray, Task, drifted
 from sd_friction_env.physics.parameters import EXCITATIONS, RANGES, Kind, OscillatorParameters, plant_of
 
 
@@ -31,6 +31,13 @@ class Plants:
         numbers = np.repeat(self.nominal_column, len(keys), axis=1)
         for name, values in self._task.draws(keys, episodes).items():
             numbers[self.names.index(name)] = values
+        return numbers
+
+    def drift(self, numbers: FloatArray, ends: FloatArray, steps: IntegerArray) -> FloatArray:
+        """Return columns after some steps of their episodes; ``ends`` are the values at the end, in order of names."""
+        rows = [self.names.index(name) for name in self._task.drift]
+        numbers = numbers.copy()
+        numbers[rows] = drifted(numbers[rows], ends, steps, self._task.episode_steps)
         return numbers
 
     def column_of(self, parameters: OscillatorParameters) -> tuple[list[float], int]:
@@ -67,7 +74,7 @@ class Plants:
     def kinds_of(self, numbers: FloatArray, laws: IntegerArray) -> list[tuple[Kind, IntegerArray]]:
         """Return the kinds of plant among columns, each with the positions of its columns."""
         rows = self.by_name(numbers)
-        excited = np.full(len(laws), self._task.show_phases)
+        excited = np.full(len(laws), self._task.always_excited)
         for means in EXCITATIONS:
             excited |= rows[f"{means}_amplitude"] > 0.0
         codes = 4 * laws + 2 * (rows["alpha"] == 0.0) + excited

@@ -20,7 +20,7 @@ from sd_friction_env.environments.options import (
     clipped_action,
 )
 from sd_friction_env.environments.states import EnvState, check_state, read_state, write_state
-from sd_friction_env.environments.task import Task, rig_arguments, steps_before_last_quarter
+from sd_friction_env.environments.task import Task, drifted, rig_arguments, steps_before_last_quarter
 from sd_friction_env.physics.parameters import OscillatorParameters, plant_of
 from sd_friction_env.pictures.renderer import checked_size
 
@@ -109,7 +109,7 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
     `parameters` (an :class:`OscillatorParameters` or a mapping of its fields), `render_mode`, `render_size` (width and
     height of a frame in pixels), `reward`, and every field of :class:`Task`: `actuator`, `force_limit`,
     `belt_authority`, `belt_acceleration_limit`, `control_interval`, `episode_steps`, `w_effort`, `w_stick`, `start`,
-    `kick`, `randomise`, `show_parameters`, `show_phases`, `sensor`, `sensor_noise`, `sensor_delay`,
+    `kick`, `randomise`, `drift`, `show_parameters`, `show_phases`, `sensor`, `sensor_noise`, `sensor_delay`,
     `contact_loss_cost`, `observation_limit`, `x_offset`, `x_scale`, `v_scale`.
 
     ```python
@@ -149,6 +149,7 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         self._display = None if render_mode is None else Display(task, render_mode, self.render_size)
         self._key: int | None = None
+        self._drift_ends: dict[str, float] = {}  # of the running episode, once they are needed
         self._running = False
         self._observations = np.zeros((1, size), np.float32)
         # All arrays are views of one: each array passed to compiled code makes the call slower.
@@ -207,9 +208,21 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
         kind = self.task.kind_of(p)
         return p.plant if kind == p.kind else plant_of(kind, p.values)
 
+    def _drift(self) -> None:
+        """Put the plant of the next control interval into the memory."""
+        key, episode = self._counts[[kernel.COUNT_KEY, kernel.COUNT_EPISODE]]
+        if not self._drift_ends:
+            self._drift_ends = {name: float(end[0]) for name, end in self.task.drift_ends(key, episode).items()}
+        steps, limit = int(self._counts[kernel.COUNT_STEPS, 0]), int(self._codes[kernel.TASK_EPISODE_STEPS])
+        start = self._parameters.values
+        now = {name: drifted(start[name], end, steps, limit) for name, end in self._drift_ends.items()}
+        leaves = kernel.leaves_of(plant_of(self.task.kind_of(self._parameters), start | now))
+        self._memory[self._head : self._head + len(leaves)] = leaves
+
     def _use(self, parameters: OscillatorParameters) -> None:
         """Begin an episode with these parameters, the belt at its nominal speed."""
         self._parameters = parameters
+        self._drift_ends = {}
         plant = self._plant()
         numbers = (kernel.leaves_of(plant), kernel.tables_of(plant))
         self._memory = np.concatenate((self._memory[: self._head], *numbers))
@@ -221,7 +234,7 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
 
     @property
     def parameters(self) -> OscillatorParameters:
-        """Parameters of the current episode."""
+        """Parameters of the current episode, at its start where some drift."""
         return self._parameters
 
     # Episodes ---------------------------------------------------------------------------------------------------------
@@ -284,6 +297,8 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
                 a = clipped_action(action)
         except (AttributeError, TypeError, ValueError):
             a = clipped_action(action)
+        if self.task.drift:
+            self._drift()
         info = new_step_info()
         (
             info["x"], info["v"], info["v_belt"], info["v_rel"], info["mode"], info["normal_force"], info["time"],

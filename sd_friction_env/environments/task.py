@@ -79,6 +79,9 @@ class Task:
         kick: initial velocity of a mass that starts at its equilibrium, in [-10, 10].
         randomise: ranges (low, high) of parameters drawn uniformly at each reset, by name; parameters of a user-defined
             law as ``friction.NAME`` or ``geometry.NAME``.
+        drift: ranges (low, high) of the values that parameters reach at the end of an episode, drawn uniformly at each
+            reset, by name as in ``randomise`` but for ``belt_speed``. A parameter changes linearly from its value at
+            the reset, in steps at the control intervals.
         show_parameters: whether the observation ends with the randomised parameters, each scaled to [-1, 1].
         show_phases: whether the observation has the cosine and sine of the phase of each excitation (force, ripple,
             stiffness).
@@ -107,6 +110,7 @@ class Task:
     start: Start = "cycle"
     kick: float = 0.1
     randomise: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    drift: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     show_parameters: bool = False
     show_phases: bool = False
     sensor: Sensor = "state"
@@ -133,7 +137,10 @@ class Task:
         for name in ("show_parameters", "show_phases"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name} must be True or False, got {getattr(self, name)!r}")
-        object.__setattr__(self, "randomise", _checked_randomisation(self.randomise))
+        object.__setattr__(self, "randomise", _checked_ranges("randomise", self.randomise))
+        object.__setattr__(self, "drift", _checked_ranges("drift", self.drift))
+        if "belt_speed" in self.drift:
+            raise ValueError("drift cannot change 'belt_speed': actions and rewards are relative to it")
 
     @classmethod
     def field_names(cls) -> tuple[str, ...]:
@@ -176,10 +183,15 @@ class Task:
         phases = 2 * len(EXCITATIONS) if self.show_phases else 0
         return 1 + (self.sensor == "state") + self.sees_belt + phases + len(self.shown)
 
+    @property
+    def always_excited(self) -> bool:
+        """Whether plants count as excited even at amplitude 0: phases are shown, or an amplitude drifts."""
+        return self.show_phases or any(f"{means}_amplitude" in self.drift for means in EXCITATIONS)
+
     def kind_of(self, parameters: OscillatorParameters) -> Kind:
-        """Return the kind of an episode's plant; it is excited if phases are shown, even at amplitude 0."""
+        """Return the kind of an episode's plant."""
         kind = parameters.kind
-        return kind._replace(excited=kind.excited or self.show_phases)
+        return kind._replace(excited=kind.excited or self.always_excited)
 
     def actuator_of(self, parameters: OscillatorParameters) -> kernel.Actuator:
         """Return what an action does to this plant, as the kernel takes it."""
@@ -244,11 +256,11 @@ class Task:
         Args:
             keys, episodes: (n,), whole numbers; the values of an episode depend on its own key and number only.
         """
-        values = {}
-        for name, (low, high) in self.randomise.items():
-            shares = kernel.random_uniforms(keys, episodes, 0, _slot_of(name))
-            values[name] = low + (high - low) * shares
-        return values
+        return {name: _drawn(name, limits, keys, episodes) for name, limits in self.randomise.items()}
+
+    def drift_ends(self, keys: IntegerArray, episodes: IntegerArray) -> dict[str, FloatArray]:
+        """Return the values that drifting parameters reach at the end of n episodes, by name, each (n,)."""
+        return {name: _drawn(f"drift {name}", limits, keys, episodes) for name, limits in self.drift.items()}
 
     def phases(self, keys: IntegerArray, episodes: IntegerArray) -> FloatArray:
         """Return the phases of the passive cycle at which n episodes start, (n,)."""
@@ -306,6 +318,17 @@ class Task:
         return cycle.state(phase)
 
 
+def _drawn(name: str, limits: tuple[float, float], keys: IntegerArray, episodes: IntegerArray) -> FloatArray:
+    low, high = limits
+    shares: FloatArray = kernel.random_uniforms(keys, episodes, 0, _slot_of(name))
+    return low + (high - low) * shares
+
+
+def drifted(start: Any, end: Any, steps: Any, episode_steps: int) -> Any:
+    """Return a drifting parameter after some steps of an episode, from its values at the episode's start and end."""
+    return start + (end - start) * (steps / episode_steps)
+
+
 def _slot_of(name: str) -> int:
     """Return a parameter's slot of the random numbers."""
     if name in RANDOMISABLE:
@@ -318,27 +341,27 @@ def steps_before_last_quarter(episode_steps: int) -> int:
     return episode_steps - max(1, episode_steps // 4)
 
 
-def _checked_randomisation(randomise: Any) -> dict[str, tuple[float, float]]:
-    if not isinstance(randomise, Mapping):
-        raise TypeError(f"randomise must map parameter names to (low, high), got {randomise!r}")
+def _checked_ranges(argument: str, ranges: Any) -> dict[str, tuple[float, float]]:
+    if not isinstance(ranges, Mapping):
+        raise TypeError(f"{argument} must map parameter names to (low, high), got {ranges!r}")
     checked = {}
-    for name, interval in randomise.items():
+    for name, interval in ranges.items():
         user_defined = isinstance(name, str) and name.startswith(("friction.", "geometry."))
         if name not in RANDOMISABLE and not user_defined:
             allowed = f"{', '.join(RANDOMISABLE)}, and friction.NAME or geometry.NAME of a user-defined law"
-            raise ValueError(f"randomise has no parameter {name!r}; allowed: {allowed}")
+            raise ValueError(f"{argument} has no parameter {name!r}; allowed: {allowed}")
         try:
             low, high = interval
         except (TypeError, ValueError):
-            raise ValueError(f"randomise[{name!r}] must be a pair (low, high), got {interval!r}") from None
+            raise ValueError(f"{argument}[{name!r}] must be a pair (low, high), got {interval!r}") from None
         range_of = RANGES.get(name, (-1e12, 1e12))
-        low = checked_number(f"randomise[{name!r}] low", low, *range_of)
-        high = checked_number(f"randomise[{name!r}] high", high, *range_of)
+        low = checked_number(f"{argument}[{name!r}] low", low, *range_of)
+        high = checked_number(f"{argument}[{name!r}] high", high, *range_of)
         if low > high:
-            raise ValueError(f"randomise[{name!r}] must have low <= high, got {interval!r}")
+            raise ValueError(f"{argument}[{name!r}] must have low <= high, got {interval!r}")
         if name == "alpha" and low < SMALLEST_ALPHA and high > 0.0:
             raise ValueError(
-                f"randomise['alpha'] low must be at least {SMALLEST_ALPHA:g} where alpha varies, got {low!r}"
+                f"{argument}['alpha'] low must be at least {SMALLEST_ALPHA:g} where alpha varies, got {low!r}"
             )
         checked[name] = (low, high)
     return dict(sorted(checked.items()))

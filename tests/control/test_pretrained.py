@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from scripts import pretrain
-from sd_friction_env import ENVIRONMENT_IDS, load_pretrained
+from sd_friction_env import load_pretrained
 from sd_friction_env.control import pretrained
 from sd_friction_env.control.policies import PolicyFileError, load_policy
+from sd_friction_env.environments.ids import SOLVED_IDS
 from sd_friction_env.learning import evaluation, runs
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENT_IDS)
+@pytest.mark.parametrize("env_id", SOLVED_IDS)
 def test_every_environment_has_an_agent_that_does_what_its_file_says(env_id):
     policy = load_pretrained(f"sd_friction_env:{env_id}")
     said = policy.metadata["evaluation"]
@@ -27,7 +28,7 @@ def test_every_environment_has_an_agent_that_does_what_its_file_says(env_id):
     assert {"command", "seed", "versions", "run", "algorithm"} <= set(policy.metadata)
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENT_IDS)
+@pytest.mark.parametrize("env_id", SOLVED_IDS)
 def test_the_packaged_agent_is_the_best_run_of_its_task(env_id):
     policy = load_pretrained(env_id)
     name = next(name for name in pretrain.NAMES if pretrain.environment_id(*name.split("-")) == env_id)

@@ -193,6 +193,8 @@ def test_contact_is_lost_as_in_a_single_environment():
         {"randomise": {"alpha": (0.2, 0.9), "v_m": (0.3, 0.6)}, "show_parameters": True, "sensor_noise": 0.1},
         {"randomise": {"belt_speed": (0.3, 0.5), "alpha": (0.1, 0.9)}},
         {"randomise": {"alpha": (0.2, 1.5)}, "start": "rest"},
+        {"drift": {"alpha": (0.2, 0.9), "v_m": (0.3, 0.6)}, "randomise": {"v_m": (0.3, 0.6)}},
+        {"drift": {"ripple_amplitude": (0.0, 0.1), "ripple_frequency": (0.5, 2.0)}},
         {"start": "random", "observation_limit": 0.5},
         {"parameters": {"belt_speed": 0.42}},
         {"parameters": {"belt_speed": 0.6}},

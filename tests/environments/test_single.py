@@ -36,9 +36,14 @@ def roll(env, seed, steps, action_seed=0):
     return out
 
 
-def test_the_six_ids_are_registered():
+def test_these_ids_are_registered():
     assert sorted(ENVIRONMENT_IDS) == [
         "SDFriction/BeltSpeed-v0",
+        "SDFriction/BeltSpeedBlind-v0",
+        "SDFriction/BeltSpeedBlindHard-v0",
+        "SDFriction/BeltSpeedBlindLate-v0",
+        "SDFriction/BeltSpeedDrifting-v0",
+        "SDFriction/BeltSpeedExcited-v0",
         "SDFriction/BeltSpeedRandomised-v0",
         "SDFriction/BeltSpeedSensed-v0",
         "SDFriction/Force-v0",
@@ -322,6 +327,37 @@ def test_starts_by_option_and_argument():
     assert len(states) == 20
 
 
+def test_a_drifting_parameter_moves_in_a_line_from_its_start_to_what_was_drawn_for_the_end():
+    drift = {"alpha": (0.6, 0.7), "mu_m": (0.1, 0.12)}
+    env = make("SDFriction/BeltSpeed-v0", drift=drift, episode_steps=40)
+    actions = np.random.default_rng(4).uniform(-1.0, 1.0, (40, 1)).astype(np.float32)
+    ends = []
+    for seed in (3, 4):
+        env.reset(seed=seed)
+        state = env.get_state()
+        end = {name: float(v[0]) for name, v in env.task.drift_ends(np.array([state.key]), np.array([0])).items()}
+        assert all(drift[name][0] <= value <= drift[name][1] for name, value in end.items())
+        ends.append(end)
+        for k, action in enumerate(actions):
+            now = {"alpha": 0.8 + (end["alpha"] - 0.8) * k / 40, "mu_m": 0.05 + (end["mu_m"] - 0.05) * k / 40}
+            constant = make("SDFriction/BeltSpeed-v0", parameters=now, x_offset=0.0, x_scale=1.0, v_scale=1.0)
+            constant.reset(seed=0)
+            here = env.get_state()
+            constant.set_state(dataclasses.replace(here, parameters=constant.nominal))
+            result, expected = env.step(action), constant.step(action)
+            assert result[4]["x"] == pytest.approx(expected[4]["x"], rel=1e-12)
+            assert result[1] == pytest.approx(expected[1], rel=1e-12)
+        assert env.parameters == env.nominal  # those at the start
+        env.set_state(here)
+        assert env.step(action)[1] == result[1]
+    assert ends[0] != ends[1]
+
+
+def test_a_drift_to_where_a_parameter_starts_changes_nothing():
+    runs = [roll(make("SDFriction/Force-v0", **task), 2, 60) for task in ({}, {"drift": {"mu_m": (0.05, 0.05)}})]
+    assert same([step[1] for step in runs[0][1:]], [step[1] for step in runs[1][1:]], exact=True)
+
+
 def test_randomised_parameters_are_drawn_per_episode_and_hidden_unless_asked_for():
     env = make("SDFriction/BeltSpeedRandomised-v0")
     assert env.observation_space.shape == (3,)
@@ -482,6 +518,10 @@ def test_a_bad_option_is_refused_and_the_episode_goes_on(options, message):
         ({"randomise": {"alpha": 0.9}}, ValueError, "must be a pair"),
         ({"randomise": {"belt_speed": (0.0, 0.1)}}, ValueError, "belt_speed must be at least 1e-06"),
         ({"randomise": {"mu_m": (0.1, 0.3)}}, ValueError, "mu_m must not exceed"),
+        ({"drift": {"mu_m": (0.1, 0.3)}}, ValueError, "mu_m must not exceed"),
+        ({"drift": {"alfa": (0, 1)}}, ValueError, "drift has no parameter 'alfa'"),
+        ({"drift": {"belt_speed": (0.1, 0.2)}}, ValueError, "drift cannot change 'belt_speed'"),
+        ({"drift": {"alpha": (0.5, 0.6)}, "parameters": {"alpha": 0.0}}, ValueError, "alpha = 0 .* cannot drift"),
         ({"parameters": {"belt_speed": 0}}, ValueError, "belt_speed must be at least 1e-06"),
         ({"parameters": 3}, TypeError, "parameters must be"),
         ({"parameters": {3: 1}}, TypeError, "parameters must map parameter names to values, got the name 3"),

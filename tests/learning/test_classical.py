@@ -15,9 +15,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sd_friction_env import ENVIRONMENT_IDS, equilibria, storage
+from sd_friction_env import equilibria, storage
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import ConstantPolicy, LinearFeedback, VelocityFeedback
+from sd_friction_env.environments.ids import SOLVED_IDS
 from sd_friction_env.learning import classical, evaluation, scores
 from sd_friction_env.physics import theory
 
@@ -123,7 +124,7 @@ def test_lqr_needs_the_velocity():
         classical.lqr_gains(evaluation.make_env("SDFriction/ForceSensed-v0"), 1.0, 1.0)
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENT_IDS)
+@pytest.mark.parametrize("env_id", SOLVED_IDS)
 def test_stored_gains_do_what_is_stored_with_them(env_id):
     stored = classical.stored_gains()[env_id]
     controllers = classical.classical_controllers(f"sd_friction_env:{env_id}")
@@ -143,7 +144,7 @@ def test_stored_gains_do_what_is_stored_with_them(env_id):
 
 def test_tuned_feedback_is_near_the_optimum_on_force_and_every_controller_is_better_than_none():
     seeds = evaluation.EVALUATION_SEEDS
-    for env_id in ENVIRONMENT_IDS:
+    for env_id in SOLVED_IDS:
         passive = evaluation.passive_episodes(env_id, seeds)
         without, best = evaluation.metrics(passive, passive)["return"], evaluation.optimal_returns(env_id, seeds)
         score = {}
@@ -164,7 +165,7 @@ def test_no_stored_gain_lies_where_the_search_ended():
 
 
 def test_the_bounds_are_wide_and_a_value_at_one_of_them_is_told():
-    for env_id in ENVIRONMENT_IDS:
+    for env_id in SOLVED_IDS:
         env = evaluation.make_env(env_id)
         for name in classical.kinds_for(env_id):
             for way in classical.KINDS[name].ranges(env).values():
@@ -280,13 +281,13 @@ def test_what_several_keep_at_once_is_all_kept(tmp_path, monkeypatch):
         return gains
 
     monkeypatch.setattr(classical, "stored_gains", slow)
-    with ThreadPoolExecutor(len(ENVIRONMENT_IDS)) as pool:
-        names = ["delayed displacement feedback"] * len(ENVIRONMENT_IDS)
+    with ThreadPoolExecutor(len(SOLVED_IDS)) as pool:
+        names = ["delayed displacement feedback"] * len(SOLVED_IDS)
         entry = GAIN | {"values": {"gain": 1.0, "delay": 3.0}}
-        list(pool.map(classical.keep, ENVIRONMENT_IDS, names, [entry] * len(names), [file] * len(names)))
-    assert set(read(file)) == set(ENVIRONMENT_IDS)
+        list(pool.map(classical.keep, SOLVED_IDS, names, [entry] * len(names), [file] * len(names)))
+    assert set(read(file)) == set(SOLVED_IDS)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["gains.json", "gains.json.previous"]
-    assert len(read(tmp_path / "gains.json.previous")) == len(ENVIRONMENT_IDS) - 1
+    assert len(read(tmp_path / "gains.json.previous")) == len(SOLVED_IDS) - 1
 
 
 def test_a_lock_that_another_process_left_behind_does_not_stop_anyone(tmp_path):

@@ -14,7 +14,7 @@ from sd_friction_env.control.policies import PolicyFileError
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.learning import evaluation, optimal, scores
 from sd_friction_env.learning.evaluation import EVALUATION_SEEDS
-from sd_friction_env.learning.optimal import RANDOMISED, SENSED, TASKS, OptimalPolicy
+from sd_friction_env.learning.optimal import OPEN, RANDOMISED, SENSED, TASKS, OptimalPolicy
 
 STORED = [*TASKS.values(), *RANDOMISED.values()]
 
@@ -100,7 +100,7 @@ def test_sensed_tier_has_the_nominal_optimum_for_a_replay_there_returns_the_same
     np.testing.assert_allclose(replayed, reference[:5], rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("env_id", RANDOMISED.values())
+@pytest.mark.parametrize("env_id", [*RANDOMISED.values(), *(OPEN[tier]["belt"] for tier in ("drifting", "excited"))])
 def test_problem_of_many_plants_is_each_of_them_alone(env_id):
     problem = optimal.make_problem(env_id, range(4))
     assert len(problem.plants) == 4

@@ -72,9 +72,9 @@ class ThresholdFollower(Feedback):
         return {"belt_speed": env.nominal.belt_speed, "belt_authority": env.task.belt_authority}
 
     def _act(self, values: _Floats, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
-        return self._follow(values[..., 1], self.belt_speed), None
+        return self.follow(values[..., 1], self.belt_speed), None
 
-    def _follow(self, v: _Floats, belt_speed: _Floats | float) -> _Floats:
+    def follow(self, v: _Floats, belt_speed: _Floats | float) -> _Floats:
         """Return the actions (...), not yet clipped, at velocities (...) and nominal belt speeds (...)."""
         follows = v < self.threshold * (1.0 - self.belt_authority) * belt_speed
         return np.where(follows, self.gain * v / belt_speed, -1.0)
@@ -122,7 +122,7 @@ class EstimatingFollower(ThresholdFollower):
         if not self.waits:
             estimate = np.where(stuck, estimate, np.maximum(estimate, ratio))
         estimate = np.where(sticks, ratio, estimate)
-        return self._follow(v, estimate), (ratio, estimate, stuck)
+        return self.follow(v, estimate), (ratio, estimate, stuck)
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class ObservingFollower(ThresholdFollower):
             steps.append(self._advance(steps[-1], actions[..., i]))
         # As the environment takes it: clipped, in single precision.
         now = steps[-1]
-        wanted = self.rollout.best_actions(now) if self.rollout else self._follow(now[..., 1], self.belt_speed)
+        wanted = self.rollout.best_actions(now) if self.rollout else self.follow(now[..., 1], self.belt_speed)
         action = np.clip(wanted, -1.0, 1.0).astype(np.float32).astype(float)
         actions = np.concatenate([actions, action[..., None]], axis=-1)
         if not self.sensor_delay:

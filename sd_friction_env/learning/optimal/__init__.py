@@ -12,7 +12,8 @@ the true optimum. The sequences are stored with the returns, so that anyone can 
 
 On the randomised tier every episode has its own plant, and the optimum knows it: an upper bound for controllers that do
 not. The sensed tier has the plant, starts and reward of the nominal one, hence its optimum, which sees the state: again
-an upper bound.
+an upper bound. So have the open tiers "blind" and "blind-late" those of the randomised one. Where a plant
+changes during an episode, stage 1 is that of the plant at the start, and the later stages know the changes to come.
 """
 
 from sd_friction_env.learning.optimal.grid import (
@@ -22,7 +23,7 @@ from sd_friction_env.learning.optimal.grid import (
     value_iteration,
 )
 from sd_friction_env.learning.optimal.policy import OptimalPolicy, save_value
-from sd_friction_env.learning.optimal.problem import RANDOMISED, SENSED, TASKS, Problem, make_problem
+from sd_friction_env.learning.optimal.problem import OPEN, RANDOMISED, SENSED, TASKS, Problem, make_problem
 from sd_friction_env.learning.optimal.refinement import refine, settle
 from sd_friction_env.learning.optimal.search import greedy_actions
 from sd_friction_env.learning.optimal.stored import (

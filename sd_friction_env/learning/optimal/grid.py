@@ -64,13 +64,13 @@ def make_grid(problem: Problem, sizes: Sequence[int]) -> Grid:
         problem: of one plant. sizes: nodes along x, v_rel and, where the belt moves, v_belt.
 
     Raises:
-        ValueError: if the number of sizes or one of them does not fit, or the problem has several plants.
+        ValueError: if the number of sizes or one of them does not fit, or the problem has not one plant that stays.
     """
     env_id, belt_moves = problem.env_id, problem.belt_moves
     if len(sizes) != 2 + belt_moves or min(sizes) < 3:
         raise ValueError(f"{env_id} needs {2 + belt_moves} grid sizes of at least 3, got {tuple(sizes)!r}")
-    if len(problem.plants) != 1:
-        raise ValueError(f"a grid is for one plant, got a problem with {len(problem.plants)}")
+    if len(problem.plants) != 1 or problem.changes:
+        raise ValueError(f"a grid is for one plant that does not change, got a problem with {len(problem.plants)}")
     parameters = problem.parameters[0]
     cycle = passive_motion(parameters)
     assert cycle is not None

@@ -104,7 +104,7 @@ def _follow(
         off = now[..., :size] - states[:, None, t, :size]
         wanted = actions[:, None, t] + changes[..., t] + np.sum(gains[..., t, :] * off, axis=-1)
         taken[..., t] = np.clip(wanted, -1.0, 1.0)
-        now, rewards = problem.step(now, taken[..., t])
+        now, rewards = problem.step(now, taken[..., t], t)
         returns += rewards
     return taken, returns
 
@@ -194,7 +194,7 @@ def settle(problem: Problem, actions: Array, gains: Sequence[float] = (0.1, 0.25
         now = np.repeat(states[:, None, first], m, axis=1)
         for t in range(first, problem.steps):
             ends[..., t] = np.clip(factors * now[..., 1], -1.0, 1.0)
-            now, reward = problem.step(now, ends[..., t])
+            now, reward = problem.step(now, ends[..., t], t)
             totals += reward
         candidates.append(ends[np.arange(n), totals.argmax(axis=1)])
     return best_of(problem, candidates)

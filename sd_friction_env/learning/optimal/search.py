@@ -1,5 +1,6 @@
 """Action sequences from a value function: greedy rollouts and beam search on the true dynamics."""
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -31,8 +32,10 @@ def greedy_actions(
         if prefix is not None and t < decided:
             sequences[:, t] = prefix[:, t]
         else:
-            sequences[:, t] = look_ahead(problem.step, value.grid, value.after_first, states, count)
-        states, _ = problem.step(states, sequences[:, t])
+            sequences[:, t] = look_ahead(
+                functools.partial(problem.step, t=t), value.grid, value.after_first, states, count
+            )
+        states, _ = problem.step(states, sequences[:, t], t)
     return sequences
 
 
@@ -77,7 +80,7 @@ def beam_actions(
     rows = np.arange(n)[:, None]
     for t in progress(range(steps), "beam search"):
         ends, rewards = problem.step(
-            np.repeat(states[:, :, None], count, axis=2), np.broadcast_to(tried, (n, width, count))
+            np.repeat(states[:, :, None], count, axis=2), np.broadcast_to(tried, (n, width, count)), t
         )
         sums = totals[:, :, None] + rewards
         scores = (sums + value.grid.interpolate(value.after_first, ends)).reshape(n, -1)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env.control.pretrained import close
 from sd_friction_env.learning.optimal.problem import (
+    OPEN,
     RANDOMISED,
     SENSED,
     TASKS,
@@ -32,10 +33,12 @@ from sd_friction_env.storage import (
 )
 
 OPTIMUM_DIRECTORY = AGENTS / "optimum"
-# The files' names; the sensed tier differs from the nominal one only in what a controller sees.
+# The files' names; tiers that differ only in what a controller sees share one.
 _FILES = {
     **{env_id: task for tier in (TASKS, SENSED) for task, env_id in tier.items()},
     **{env_id: f"{task}-randomised" for task, env_id in RANDOMISED.items()},
+    **{OPEN[tier]["belt"]: "belt-randomised" for tier in ("blind", "blind-late")},
+    **{OPEN[tier]["belt"]: f"belt-{tier}" for tier in ("blind-hard", "drifting", "excited")},
 }
 ACTION_LEVELS = 32767  # stored actions are whole numbers of 1/32767: half the size, and far finer than it matters
 GOLDEN_STEPS = 60
@@ -188,8 +191,8 @@ def stored_study(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[str, 
 
 def command_of(env_id: str) -> str:
     """Return the command that computes the optimum of an environment."""
-    task, _, randomised = _FILES[env_id].partition("-")
-    return f"sd-friction optimum --task {task}" + (" --tier randomised" if randomised else "")
+    task, _, tier = _FILES[env_id].partition("-")
+    return f"sd-friction optimum --task {task}" + (f" --tier {tier}" if tier else "")
 
 
 @functools.lru_cache(maxsize=8)
@@ -224,9 +227,9 @@ def optimal_returns(
 ) -> NDArray[np.float64] | None:
     """Return the best known undiscounted return from the starts of ``reset(seed=...)``, shape (n,).
 
-    On the randomised tier it is that of a controller that knows each episode's parameters; on the sensed tier that of
-    one that sees the state (the nominal optimum: plant, starts and reward are the same). Both are upper bounds for
-    controllers that do not. None if the id has no reference.
+    Where parameters are hidden it is that of a controller that knows each episode's parameters and their changes to
+    come; where the sensor sees x only, of one that sees the state (tiers that differ in the sensor share plants, starts
+    and optimum). Both are upper bounds for controllers that do not. None if the id has no reference.
 
     Raises:
         ValueError: if a seed is not among those stored.

@@ -62,8 +62,8 @@ def find_optimum(
         for i in progress(range(len(plants)), f"plants on {name}") if len(plants) > 1 else (0,):
             rows = plants[i]
             part = problem.select(rows)
-            grid = make_grid(part, sizes)
-            value = value_iteration(part, grid, grid_actions(part, grid), progress)
+            grid = make_grid(part.frozen, sizes)
+            value = value_iteration(part.frozen, grid, grid_actions(part.frozen, grid), progress)
             estimate[rows] = grid.interpolate(value.whole, part.starts)
             greedy[rows] = greedy_actions(part, value, progress)
             if beam:

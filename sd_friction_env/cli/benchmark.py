@@ -11,7 +11,7 @@ from sd_friction_env.cli.agents import AGENTS_TEXT, agent_of
 from sd_friction_env.cli.evaluate import check_episodes
 from sd_friction_env.cli.options import Command, FailedError, UsageError, check_at_least, check_file, progress_bar
 from sd_friction_env.control.policies import Policy
-from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
+from sd_friction_env.environments.ids import OPEN_TIERS, TASKS, TIERS, environment_id
 from sd_friction_env.learning import evaluation, off_nominal, protocol
 
 TEXT = """\
@@ -19,6 +19,7 @@ run evaluates a controller on the protocol's 100 episodes of every environment t
 JSON file with a digest. verify runs the controller again and compares. table ranks entries. off-nominal evaluates
 controllers, unchanged, on fifteen plants that they were not made for. A controller is %s: a policy, or a class or
 function that makes one, from the current folder or an installed package. docs/howto/benchmark.md shows an example."""
+_TIERS = (*TIERS, *OPEN_TIERS)
 _CONTROLLERS = ("passive", "threshold-follower", "threshold-follower@randomised", "pretrained", "pretrained@randomised")
 
 
@@ -50,7 +51,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
         parser_of.add_argument("--episodes", type=int, default=episodes, metavar="N", help=text)
     for parser_of in (run, table):
         parser_of.add_argument("--task", nargs="+", choices=TASKS, default=TASKS, help="these only (default: all)")
-        parser_of.add_argument("--tier", nargs="+", choices=TIERS, default=TIERS, help="these only (default: all)")
+        parser_of.add_argument("--tier", nargs="+", choices=_TIERS, default=_TIERS, help="these only (default: all)")
     for parser_of in (table, plants):
         parser_of.add_argument("--format", choices=("markdown", "csv"), default="markdown", help="(default: markdown)")
 
@@ -58,7 +59,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 def _environments(options: argparse.Namespace) -> list[str]:
     found = []
     for task, tier in itertools.product(options.task, options.tier):
-        with contextlib.suppress(KeyError, ValueError):  # a tier that the task does not have
+        with contextlib.suppress(ValueError):  # a tier that the task does not have
             found.append(environment_id(task, tier))
     known = [env_id for env_id in ENVIRONMENT_IDS if env_id in found]
     if not known:
@@ -139,8 +140,8 @@ def _off_nominal(options: argparse.Namespace) -> int:
     policies = {}
     for spec in options.policy:
         name, at, tier = spec.partition("@")
-        if at and tier not in TIERS:
-            raise UsageError(f"--policy POLICY@TIER must name one of {', '.join(TIERS)}, got {spec!r}")
+        if at and tier not in _TIERS:
+            raise UsageError(f"--policy POLICY@TIER must name one of {', '.join(_TIERS)}, got {spec!r}")
         policies[spec] = agent_of(name, environment_id(options.task, tier or "nominal"))
     seeds = evaluation.EVALUATION_SEEDS[: options.episodes]
     table = off_nominal.evaluate_off_nominal(policies, environment_id(options.task), seeds)

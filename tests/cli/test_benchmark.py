@@ -177,7 +177,7 @@ def test_what_cannot_be_run_is_refused_by_name_and_nothing_is_written(mine, tmp_
 
 def test_off_nominal_prints_a_line_for_each_plant(capsys):
     assert main(["benchmark", "off-nominal", "--policy", "passive@wild"]) == 2
-    assert "nominal, randomised, sensed, got 'passive@wild'" in capsys.readouterr().err
+    assert "excited, got 'passive@wild'" in capsys.readouterr().err
     assert main(["benchmark", "off-nominal", "--episodes", "0"]) == 2
     assert "--episodes must be in [1, 100], got 0" in capsys.readouterr().err
 

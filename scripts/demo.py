@@ -140,9 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         heading("4/4  Passive, classical and learned on the same 100 starts")
         rows = []
         for task, env_id in TASKS.items():
-            gains = classical.stored_gains()[env_id]
-            best = max(gains, key=lambda name: gains[name]["validation_return"])
-            feedback = classical.classical_controllers(env_id)[best]
+            best, feedback = classical.best_controller(env_id)
             policies: dict[str, Policy] = {"passive": ZeroPolicy(), f"{best}, tuned": feedback, "PPO": learned[task]}
             rows += compare(task, policies)
         print(evaluation.format_summary(rows))

@@ -10,6 +10,7 @@ no seal and are read without one where the caller allows it.
 
 import contextlib
 import datetime
+import functools
 import hashlib
 import io
 import itertools
@@ -212,7 +213,8 @@ def json_text(content: Mapping[str, Any], indent: int | None) -> str:
     """Return an object as JSON, indented by ``indent``; None: with one line for each of its values."""
     if indent is not None:
         return json.dumps(content, indent=indent, allow_nan=False) + "\n"
-    lines = [f"  {json.dumps(name)}: {json.dumps(value, allow_nan=False)}" for name, value in content.items()]
+    dense = functools.partial(json.dumps, allow_nan=False, separators=(",", ":"))
+    lines = [f"  {json.dumps(name)}: {dense(value)}" for name, value in content.items()]
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 

@@ -89,7 +89,7 @@ def test_the_pages_that_teach_have_python_in_them():
 # What takes minutes, serves until it is stopped, or needs a run that another command makes: only its options are read.
 NOT_RUN = re.compile(
     r"sd-friction (train|tune|tune-classical|optimum|report|explore|evaluate .*gradient-mpc|evaluate runs/|"
-    r"export runs/|.*runs/)"
+    r"export runs/|.*runs/|.*mine)"
 )
 OURS = [pair for pair in COMMANDS if pair[1].startswith("sd-friction ")]
 

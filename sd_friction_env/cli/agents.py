@@ -1,5 +1,8 @@
 """Agents and controllers as commands name them."""
 
+import os
+import pkgutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -7,6 +10,7 @@ from typing import Any
 from sd_friction_env import ENVIRONMENT_IDS, load_pretrained
 from sd_friction_env.cli.options import UsageError
 from sd_friction_env.control.policies import (
+    ConstantPolicy,
     GradientPolicy,
     NetworkPolicy,
     Policy,
@@ -17,7 +21,8 @@ from sd_friction_env.control.policies import (
     rollout_follower,
     threshold_follower,
 )
-from sd_friction_env.learning import evaluation, runs
+from sd_friction_env.extras import extra
+from sd_friction_env.learning import classical, evaluation, runs
 from sd_friction_env.learning.optimal import OptimalPolicy
 
 # On force near the best there is. On belt the belt follows the mass, which makes matters worse at any gain.
@@ -30,6 +35,9 @@ MADE_FROM_ENV: dict[str, Callable[[Any], Policy]] = {
     "sampling-mpc": SamplingPolicy.from_env,
     "gradient-mpc": GradientPolicy.from_env,
 }
+CONSTANTS = {"passive": ZeroPolicy(), "constant-1": ConstantPolicy(-1.0), "constant+1": ConstantPolicy(1.0)}
+NAMED = ("pretrained", "classical", "velocity-feedback", *MADE_FROM_ENV, *CONSTANTS)
+AGENTS_TEXT = f"{', '.join(NAMED)}, a run folder, a policy's .npz, an .onnx, or module:NAME"
 
 
 def stored_agent(path: Path) -> tuple[NetworkPolicy, dict[str, Any] | None]:
@@ -70,40 +78,66 @@ def velocity_feedback(env_id: str, env_kwargs: dict[str, Any], gain: float | Non
 
 
 def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
-    """Return the controller that --agent names: pretrained, passive, velocity-feedback, one of ``MADE_FROM_ENV``, a run
-    folder or a .npz file.
+    """Return the controller that --agent names: one of ``NAMED`` ("classical": the best of the tuned ones), a run
+    folder, a .npz or .onnx file, or module:NAME as :func:`imported_policy` takes it.
 
     Raises:
         ValueError: if there is no such agent, or it does not fit the environment.
     """
     if gain is not None and name != "velocity-feedback":
         raise UsageError(f"--gain goes with --agent velocity-feedback, not with {name!r}")
+    if name in CONSTANTS:
+        return CONSTANTS[name]
     if name == "pretrained":
         return load_pretrained(env_id)
-    if name == "passive":
-        return ZeroPolicy()
+    if name == "classical":
+        return classical.best_controller(env_id)[1]
     if name == "velocity-feedback":
         return velocity_feedback(env_id, {}, gain)[0]
     if name in MADE_FROM_ENV:
         return MADE_FROM_ENV[name](evaluation.make_env(env_id))
     path = Path(name)
+    if path.suffix.lower() == ".onnx":
+        with extra("export"):
+            from sd_friction_env.learning import export
+        return export.ExportedPolicy.load(path, evaluation.make_env(env_id))
+    if ":" in name and not path.exists():
+        return imported_policy(name, env_id)
     if path.suffix.lower() != ".npz" and not path.is_dir():
-        raise UsageError(
-            f"--agent must be pretrained, velocity-feedback, {', '.join(MADE_FROM_ENV)}, passive, a run folder or a "
-            f"policy's .npz, got {name!r}"
-        )
+        raise UsageError(f"the agent must be {AGENTS_TEXT}, got {name!r}")
     policy, _ = stored_agent(path)
     check_fit(path, policy, env_id, {})
     return policy
 
 
+def imported_policy(name: str, env_id: str) -> Policy:
+    """Return the policy of a user: module:NAME, from the current folder or an installed package.
+
+    NAME is a policy, a class of policies (made by its ``from_env(env)`` if it has one, otherwise without arguments), or
+    a function of the environment that returns one.
+
+    Raises:
+        ValueError: if it cannot be imported, or gives no policy.
+    """
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        made = pkgutil.resolve_name(name)
+    except Exception as error:  # whatever the user's module raises
+        raise UsageError(f"{name!r} cannot be imported: {type(error).__name__}: {error}") from error
+    if isinstance(made, type):
+        made = made.from_env(evaluation.make_env(env_id)) if hasattr(made, "from_env") else made()
+    elif callable(made) and not hasattr(made, "predict"):
+        made = made(evaluation.make_env(env_id))
+    if not callable(getattr(made, "predict", None)):
+        raise UsageError(f"{name!r} must be or make a policy with a method predict, got {made!r}")
+    policy: Policy = made
+    return policy
+
+
 def title_of(name: str, policy: Policy) -> str:
     """Return what a picture calls the controller that --agent names."""
-    titles = {
-        "passive": "no control",
-        "velocity-feedback": "velocity feedback",
-        **{name: name.replace("-", " ") for name in MADE_FROM_ENV},
-        "rollout": "rollout of the threshold follower",
-    }
-    algorithm = str(getattr(policy, "metadata", {}).get("algorithm", "trained"))
-    return titles.get(name, f"{algorithm.upper()} agent")
+    titles = {"passive": "no control", "rollout": "rollout of the threshold follower"}
+    if isinstance(policy, NetworkPolicy):
+        return f"{str(policy.metadata.get('algorithm', 'trained')).upper()} agent"
+    return titles.get(name, name.replace("-", " "))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sd_friction_env import Table
-from sd_friction_env.cli.agents import MADE_FROM_ENV, agent_of, check_fit, stored_agent, velocity_feedback
+from sd_friction_env.cli.agents import AGENTS_TEXT, MADE_FROM_ENV, agent_of, check_fit, stored_agent, velocity_feedback
 from sd_friction_env.cli.options import (
     Command,
     FailedError,
@@ -32,11 +32,12 @@ CONTROLLERS = ("passive", "velocity-feedback", *MADE_FROM_ENV, "constant", "clas
 
 TEXT = """\
 Passive always comes first. score: 0 passive, 1 the optimum where one is stored ("-" where none is), over the episodes
-whose optimum is known; suppressed: share of the episodes that end still (amplitude under 5% of passive), without stick,
-at nominal belt speed; both with 95% intervals over the episodes. Amplitude, reduction, stick and belt speed are of the
-last half of the episodes; settling is the mean time of those that settle; residual is the rms action of the last
-quarter; ms is the wall time of one decision for one environment. --controller classical stands for all classical
-controllers that were tuned for the environment."""
+whose optimum is known; credited: the same with credit for suppressed episodes only, the others counted as passive;
+suppressed: share of the episodes that end still (amplitude under 5% of passive), without stick, at nominal belt speed.
+Score and suppressed have 95% intervals over the episodes. Amplitude, reduction, stick and belt speed are of the last
+half of the episodes; settling is the mean time of those that settle; residual is the rms action of the last quarter; ms
+is the wall time of one decision for one environment. --controller classical stands for all classical controllers that
+were tuned for the environment."""
 
 GRID_TEXT = """\
 The episodes of `sd-friction evaluate` for every plant of the grid. --backend and --address say where it runs; the
@@ -60,7 +61,8 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes-csv", type=Path, metavar="FILE", help="write every episode of every controller")
 
 
-def _check_episodes(options: argparse.Namespace) -> None:
+def check_episodes(options: argparse.Namespace) -> None:
+    """Check --episodes against the protocol's number."""
     if not 1 <= options.episodes <= len(evaluation.EVALUATION_SEEDS):
         raise UsageError(f"--episodes must be in [1, {len(evaluation.EVALUATION_SEEDS)}], got {options.episodes}")
 
@@ -111,7 +113,7 @@ def _agents_by_environment(options: argparse.Namespace) -> dict[tuple[str, str],
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    _check_episodes(options)
+    check_episodes(options)
     check_file("--csv", options.csv)
     check_file("--episodes-csv", options.episodes_csv)
     seeds = evaluation.EVALUATION_SEEDS[: options.episodes]
@@ -159,8 +161,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _add_grid(parser: argparse.ArgumentParser) -> None:
     add_environment(parser, arguments=False)
-    names = ", ".join(MADE_FROM_ENV)
-    text = f"pretrained (default), velocity-feedback, {names}, passive, a run folder, or a policy's .npz"
+    text = f"{AGENTS_TEXT} (default: pretrained)"
     parser.add_argument("--agent", default="pretrained", help=text)
     text = "a parameter of the plant with its values or ranges from:to:step; several make a grid"
     parser.add_argument("--over", nargs="+", action="append", required=True, metavar=("NAME", "VALUE"), help=text)
@@ -170,7 +171,7 @@ def _add_grid(parser: argparse.ArgumentParser) -> None:
 
 
 def _grid(options: argparse.Namespace) -> int:
-    _check_episodes(options)
+    check_episodes(options)
     check_file("--out", options.out, ".csv")
     over: dict[str, list[float]] = {}
     for name, *texts in options.over:

@@ -29,6 +29,7 @@ _COMMANDS = {
     "bifurcation": ("analysis", "plot", "sections of a forced motion over a parameter, up and down"),
     "train": ("train", "train", "an agent that suppresses the vibration, in a run folder"),
     "evaluate": ("evaluate", "train", "agents and classical controllers compared on the protocol's episodes"),
+    "benchmark": ("benchmark", "train", "a controller entered in the benchmark; entries verified and ranked"),
     "grid": ("evaluate", "sweep", "one controller on a grid of plants, in chunks"),
     "tune": ("tune", "tune", "a search for hyperparameters with Optuna"),
     "tune-classical": ("tune", "train", "the gains of the classical controllers"),

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from sd_friction_env.cli.agents import MADE_FROM_ENV, agent_of, title_of
+from sd_friction_env.cli.agents import AGENTS_TEXT, agent_of, title_of
 from sd_friction_env.cli.options import (
     Command,
     UsageError,
@@ -81,8 +81,7 @@ def _add_explore(parser: argparse.ArgumentParser) -> None:
 
 def _add_video(parser: argparse.ArgumentParser) -> None:
     add_environment(parser, arguments=False)
-    names = ", ".join(MADE_FROM_ENV)
-    text = f"pretrained (default), velocity-feedback, {names}, passive, a run folder, or an agent's policy.npz"
+    text = f"{AGENTS_TEXT} (default: pretrained)"
     parser.add_argument("--agent", default="pretrained", metavar="AGENT", help=text)
     parser.add_argument("--gain", type=float, help="of velocity-feedback (default: 1.5 on force, 1 on belt)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.mp4 or FILE.gif")

@@ -11,7 +11,7 @@ def _position(noise: float, delay: int) -> dict[str, Any]:
 
 
 _PLANTS = {"belt_speed": (0.1, 0.35), "alpha": (0.6, 0.95), "mu_m": (0.03, 0.12)}
-_EXCITATION = {"force_amplitude": (0.005, 0.02), "force_frequency": (0.3, 1.0), "force_phase": (0.0, 2.0 * math.pi)}
+_EXCITATION = {"force_amplitude": (0.005, 0.01), "force_frequency": (0.3, 1.0), "force_phase": (0.0, 2.0 * math.pi)}
 # Part of the id, and what is hidden: parameters drawn for each episode, and what the sensor does not see.
 _TIERS: dict[str, tuple[str, dict[str, Any]]] = {
     "nominal": ("", {}),
@@ -25,7 +25,7 @@ _OPEN_TIERS: dict[str, tuple[str, dict[str, Any]]] = {
     "blind-hard": ("BlindHard", {"randomise": {**_PLANTS, "mu_s": (0.15, 0.25)}, **_position(0.02, 5)}),
     "drifting": (
         "Drifting",
-        {"randomise": _PLANTS, "drift": {name: _PLANTS[name] for name in ("alpha", "mu_m")}, **_position(0.005, 1)},
+        {"randomise": _PLANTS, "drift": {"mu_m": _PLANTS["mu_m"], "mu_s": (0.15, 0.25)}, **_position(0.005, 1)},
     ),
     "excited": ("Excited", {"randomise": _EXCITATION, **_position(0.005, 1)}),
 }

@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 from sd_friction_env import SDFrictionEnv, SDFrictionVectorEnv, Table
 from sd_friction_env.control.policies import Policy, State, ZeroPolicy
 from sd_friction_env.learning import optimal
-from sd_friction_env.learning.scores import NO_INTERVAL, RESAMPLES, score, score_interval, share_interval
+from sd_friction_env.learning.scores import (
+    NO_INTERVAL,
+    RESAMPLES,
+    credited_score,
+    score,
+    score_interval,
+    share_interval,
+)
 from sd_friction_env.physics.parameters import checked_number
 
 Array = NDArray[np.float64]
@@ -296,9 +303,9 @@ def decision_milliseconds(
     state, times = None, []
     for i in range(decisions + 1):
         begun = time.perf_counter()
-        action, state = policy.predict(observation, state, i == 0, deterministic=True)
+        actions, state = policy.predict(observation[None], state, np.array([i == 0]), deterministic=True)
         times.append(time.perf_counter() - begun)
-        observation, _, terminated, truncated, _ = env.step(action)
+        observation, _, terminated, truncated, _ = env.step(actions[0])
         if terminated or truncated:
             break
     return float(1e3 * np.median(times[1:] or times))
@@ -362,7 +369,7 @@ def summarise(
     name: str, table: Table, passive: Table, optimal: Array | None, *, seed: int = 0, resamples: int = RESAMPLES
 ) -> dict[str, Any]:
     """Return one row for a controller: means over its episodes, score and suppressed fraction with the ends of their
-    95% intervals (``score_low`` and so on).
+    95% intervals (``score_low`` and so on), and ``credited``, the score with credit for suppressed episodes only.
 
     Args:
         name: of the controller. table: of :func:`metrics`. passive: the same for no control.
@@ -370,10 +377,12 @@ def summarise(
         seed, resamples: of the score's bootstrap.
     """
     row: dict[str, Any] = {"controller": name, "return": float(table["return"].mean())}
-    row["score"], (row["score_low"], row["score_high"]), row["scored_episodes"] = float("nan"), NO_INTERVAL, 0
+    row["score"] = row["credited"] = float("nan")
+    (row["score_low"], row["score_high"]), row["scored_episodes"] = NO_INTERVAL, 0
     if optimal is not None:
         returns = table["return"], passive["return"], optimal
         row["score"], row["scored_episodes"] = score(*returns), int(np.isfinite(optimal).sum())
+        row["credited"] = credited_score(table["return"], table["suppressed"], *returns[1:])
         row["score_low"], row["score_high"] = score_interval(*returns, seed=seed, resamples=resamples)
     row["suppressed"] = float(table["suppressed"].mean())
     row["suppressed_low"], row["suppressed_high"] = share_interval(int(table["suppressed"].sum()), table.n_rows)
@@ -388,6 +397,7 @@ def summarise(
 _FORMATS = {
     "return": "{:.2f}",
     "score": "{:.3f}",
+    "credited": "{:.3f}",
     "suppressed": "{:.0%}",
     "amplitude": "{:.5f}",
     "reduction": "{:.2%}",

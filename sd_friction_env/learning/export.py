@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 import onnx
 import onnxruntime
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 import sd_friction_env
 from sd_friction_env import SDFrictionEnv
-from sd_friction_env.control.policies import NetworkPolicy
+from sd_friction_env.control.policies import Actions, NetworkPolicy, State
+from sd_friction_env.control.policies.policy import broadcast_starts
 from sd_friction_env.learning import evaluation
 from sd_friction_env.storage import atomic_file
 
@@ -192,6 +193,55 @@ def session(model: onnx.ModelProto | Path) -> onnxruntime.InferenceSession:
     options.log_severity_level = 3
     source = str(model) if isinstance(model, Path) else model.SerializeToString()
     return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedPolicy:
+    """A file that :func:`build` made, as a policy: it reads the measurements behind the observations.
+
+    Attributes:
+        runtime: session of the file. interface: of the environment. frames: measurements in its window.
+    """
+
+    runtime: onnxruntime.InferenceSession
+    interface: Interface
+    frames: int
+
+    @classmethod
+    def load(cls, path: Path, env: SDFrictionEnv) -> "ExportedPolicy":
+        """Return the policy in a file for an environment.
+
+        Raises:
+            ValueError: if it is no such file, or its measurements or its command are not the environment's.
+        """
+        interface = Interface.of(env)
+        try:
+            runtime = session(path)
+            about, shape = runtime.get_modelmeta().custom_metadata_map, runtime.get_inputs()[0].shape
+            made_for = [*json.loads(about["measurements"]), about["command"]]
+            if runtime.get_inputs()[0].name != MEASUREMENTS or len(shape) != 3:
+                raise ValueError(f"its input is not {MEASUREMENTS} of shape (n, frames, k)")
+        except Exception as error:  # the runtime has no class of errors of its own
+            reason = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{str(path)!r} is no agent of sd-friction export ({reason})") from None
+        if made_for != [*interface.names, interface.command]:
+            fits = ", ".join([*interface.names, interface.command])
+            raise ValueError(f"{str(path)!r} is for {', '.join(made_for)}, and the environment has {fits}")
+        return cls(runtime, interface, int(shape[1]))
+
+    def predict(
+        self, observation: ArrayLike, state: State = None, episode_start: ArrayLike | None = None, *_: Any, **__: Any
+    ) -> tuple[Actions, State]:
+        """Return the actions for one observation or a batch, and the window of measurements."""
+        observed = np.asarray(observation, np.float64)
+        measured = np.atleast_2d(observed * np.array(self.interface.scales) + np.array(self.interface.offsets))
+        window = np.tile(np.array(self.interface.rest, np.float32), (len(measured), self.frames, 1))
+        if state is not None:
+            goes_on = ~broadcast_starts(episode_start, measured[:, 0])
+            window[goes_on, :-1] = state[0][goes_on, 1:]
+        window[:, -1] = measured
+        (actions,) = self.runtime.run([ACTION], {MEASUREMENTS: window})
+        return (actions if observed.ndim > 1 else actions[0]), (window,)
 
 
 def trial_measurements(policy: NetworkPolicy, env_id: str, n: int, seed: int = 0) -> Measurements:

@@ -43,6 +43,15 @@ def score(returns: ArrayLike, passive: ArrayLike, optimal: ArrayLike) -> float:
     return float((mean - mean_passive) / gap)
 
 
+def credited_score(returns: ArrayLike, suppressed: ArrayLike, passive: ArrayLike, optimal: ArrayLike) -> float:
+    """Return the score with credit for suppressed episodes only: the others count as if without control.
+
+    Args:
+        suppressed: whether each episode was suppressed, shape (n,); the others as :func:`score` takes them.
+    """
+    return score(np.where(suppressed, returns, passive), passive, optimal)
+
+
 def score_interval(
     returns: ArrayLike, passive: ArrayLike, optimal: ArrayLike, *, seed: int = 0, resamples: int = RESAMPLES
 ) -> Interval:

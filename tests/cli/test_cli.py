@@ -242,7 +242,7 @@ def test_a_video_shows_any_agent_that_fits(tmp_path, capsys):
         ("--task force --out film.gif --size 10 10", "render_size width must be"),
         ("--task force --out film.mp4 --size 321 240", "--size must be even for .mp4, got 321 240"),
         ("--task force --out film.gif --seed -1", "--seed must be at least 0, got -1"),
-        ("--task force --out film.gif --agent someone", "or a policy's .npz, got 'someone'"),
+        ("--task force --out film.gif --agent someone", "or module:NAME, got 'someone'"),
         ("--task force --out film.gif --agent none.npz", "none.npz"),
         ("--task force --out film.gif --gain 2", "--gain goes with --agent velocity-feedback"),
         ("--task force --tier sensed --agent velocity-feedback --out film.gif", "sees the position only"),

@@ -170,6 +170,25 @@ def test_the_interval_of_a_score_is_the_paired_bootstrap():
     assert np.isnan(scores.score_interval([2.0], [1.0], [3.0])).all()
 
 
+def test_only_suppressed_episodes_are_credited():
+    returns, passive, optimal = [-40.0, -50.0, -300.0], [-400.0, -450.0, -500.0], [-40.0, -50.0, -60.0]
+    assert scores.credited_score(returns, [True] * 3, passive, optimal) == score(returns, passive, optimal)
+    assert scores.credited_score(returns, [False] * 3, passive, optimal) == 0.0
+    # The third episode counts as passive: 200 of the 1,200 that it could gain are not credited.
+    assert scores.credited_score(returns, [True, True, False], passive, optimal) == pytest.approx(760 / 1200)
+    assert scores.credited_score(returns, [True, True, False], passive, [*optimal[:2], np.nan]) == 1.0
+
+
+def test_a_slow_belt_has_a_score_and_no_credit():
+    seeds = evaluation.VALIDATION_SEEDS[:3]
+    passive = evaluation.passive_episodes(BELT, seeds)
+    table, baseline = evaluate(ConstantPolicy(-1.0), BELT, seeds), metrics(passive, passive)
+    row = summarise("constant -1", table, baseline, np.full(3, -40.0))
+    assert row["score"] > 0.3
+    assert row["credited"] == 0.0
+    assert "credited" in evaluation.format_summary([row]).splitlines()[0]
+
+
 def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
     assert scores.interquartile_mean([-100.0, 1.0, 2.0, 3.0, 1000.0]) == 2.0
     assert scores.interquartile_mean(np.array([[0.0, 1.0], [5.0, 90.0]])) == 3.0

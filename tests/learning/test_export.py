@@ -188,3 +188,31 @@ def test_an_agent_of_another_task_is_refused(tmp_path, capsys):
         assert main(["export", *command]) == 2
         assert "was trained on" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("env_id", "frames"), [(BELT, 1), (SENSED, 8)])
+def test_a_file_acts_in_episodes_as_its_agent_does(env_id, frames, tmp_path):
+    policy, env = network(env_id, frames), evaluation.make_env(env_id)
+    export.write(export.build(policy, env), tmp_path / "agent.onnx")
+    exported = export.ExportedPolicy.load(tmp_path / "agent.onnx", env)
+    seeds = evaluation.VALIDATION_SEEDS[:3]
+    ours, theirs = (evaluation.run_episodes(acts, env_id, seeds) for acts in (policy, exported))
+    early = slice(0, 50)  # the rounding of measurements grows later
+    assert np.abs(ours.action[:, early]).max() > 0.1
+    assert theirs.action[:, early] == pytest.approx(ours.action[:, early], abs=1e-4)
+    observation, _ = env.reset(seed=3)
+    action, state = exported.predict(observation)
+    assert action.shape == (1,)
+    again, _ = exported.predict(observation, state, True)  # a new episode: the window is empty again
+    assert again == action
+
+
+def test_a_file_is_refused_where_it_does_not_fit(tmp_path):
+    path = tmp_path / "agent.onnx"
+    export.write(export.build(network(BELT), evaluation.make_env(BELT)), path)
+    for env_id in (FORCE, SENSED, RANDOMISED):
+        with pytest.raises(ValueError, match=r"agent\.onnx' is for x, v, v_belt, target of the belt's speed, and"):
+            export.ExportedPolicy.load(path, evaluation.make_env(env_id))
+    path.write_bytes(b"no model")
+    with pytest.raises(ValueError, match=r"agent\.onnx' is no agent of sd-friction export"):
+        export.ExportedPolicy.load(path, evaluation.make_env(BELT))

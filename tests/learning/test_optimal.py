@@ -120,7 +120,9 @@ def test_a_grid_has_room_for_the_kick_where_passive_motion_dies_out():
     problem = optimal.make_problem("SDFriction/BeltSpeedBlindHard-v0", [1_000_017])
     assert passive_motion(problem.parameters[0]).amplitude == 0.0
     grid = optimal.make_grid(problem, (9, 9, 9))
-    assert all(low < at < high for low, at, high in zip(grid.lows, problem.starts[0] - [0, 0.1, 0], grid.highs))
+    x, _, v_belt = problem.starts[0]
+    assert np.all(grid.lows < np.array([x, -v_belt - 0.1, v_belt]))
+    assert np.all(grid.highs > np.array([x, 0.0, v_belt]))
 
 
 def test_batch_step_is_the_environment_step():

@@ -1,0 +1,190 @@
+"""Curves of solutions of n equations in n + 1 unknowns, by pseudo-arclength continuation.
+
+A problem gives the residual F(y) and its Jacobian; the curve F(y) = 0 is followed by its arc length, so that it may
+turn in any unknown. Special points are zeros of test functions on the curve. Keller: Numerical solution of bifurcation
+and nonlinear eigenvalue problems (1977); Kuznetsov: Elements of Applied Bifurcation Theory (2004), ch. 10.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+FloatArray = NDArray[np.float64]
+
+RESIDUAL = 1e-12  # of each equation, to which a point is corrected
+_MOST_CORRECTIONS = 12
+_SHORTEST = 1e-5  # step, in longest ones, at which a curve is given up
+_LEAST_COSINE = 0.98  # of the angle between successive tangents
+_FIRST_STEP = 0.1  # in longest ones
+
+
+class BranchEndError(ArithmeticError):
+    """The equations have no meaning beyond here; the message says why."""
+
+
+class Problem(Protocol):
+    """n equations in n + 1 unknowns y; ``scale`` (n + 1,) is the size of each unknown."""
+
+    scale: FloatArray
+
+    def residual(self, y: FloatArray) -> FloatArray:
+        """Return F(y), (n,), or raise BranchEndError."""
+
+    def jacobian(self, y: FloatArray) -> FloatArray:
+        """Return dF/dy, (n, n + 1), or raise BranchEndError."""
+
+
+class Point(NamedTuple):
+    """A point of a curve: the unknowns, the scaled unit tangent, the largest residual, and what is special about it."""
+
+    y: FloatArray
+    tangent: FloatArray
+    residual: float
+    kind: str = "point"
+
+
+class Branch(NamedTuple):
+    """Points of a curve in their order, and why it ends at the last."""
+
+    points: list[Point]
+    reason: str
+
+
+Test = Callable[[FloatArray, FloatArray], float]  # of the unknowns and the tangent
+
+
+def correct(problem: Problem, guess: FloatArray, row: FloatArray, jacobian: FloatArray | None = None) -> FloatArray:
+    """Return the solution near ``guess`` in the plane through it that is normal to ``row`` in scaled unknowns.
+
+    The Jacobian, that of a point nearby, is renewed where it does not reduce the residual well.
+
+    Raises:
+        BranchEndError: if the iteration does not converge.
+    """
+    y, before = guess.copy(), np.inf
+    for _ in range(_MOST_CORRECTIONS):
+        residual = problem.residual(y)
+        size = float(np.abs(residual).max())
+        if size <= RESIDUAL:
+            return y
+        if jacobian is None or size > 0.1 * before:
+            jacobian = problem.jacobian(y)
+        before = size
+        matrix = np.vstack((jacobian * problem.scale, row))
+        y = y + problem.scale * _solved(matrix, np.append(-residual, row @ ((guess - y) / problem.scale)))
+    raise BranchEndError("the correction does not converge")
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        raise BranchEndError("the curve is singular here") from None
+
+
+def point_at(
+    problem: Problem, y: FloatArray, along: FloatArray, kind: str = "point", jacobian: FloatArray | None = None
+) -> Point:
+    """Return a solution as a point whose tangent leads the way of ``along``."""
+    jacobian = problem.jacobian(y) if jacobian is None else jacobian
+    tangent = _solved(np.vstack((jacobian * problem.scale, along)), np.append(np.zeros(len(jacobian)), 1.0))
+    return Point(y, tangent / np.linalg.norm(tangent), float(np.abs(problem.residual(y)).max()), kind)
+
+
+def follow(
+    problem: Problem,
+    start: FloatArray,
+    along: FloatArray,
+    *,
+    longest: float,
+    limits: Mapping[int, tuple[float, float, str]],
+    tests: Mapping[str, Test],
+    most_points: int = 20_000,
+) -> Branch:
+    """Follow a curve from a solution until it ends.
+
+    Args:
+        problem: its equations.
+        start: a solution, (n + 1,).
+        along: (n + 1,), of which the scaled tangent first leads the way.
+        longest: step, in scaled unknowns.
+        limits: of unknowns, by index: low, high and a name; the last point lies on the limit.
+        tests: functions whose zeros on the curve are located, by the kind of point that they mark.
+        most_points: after which the curve is left.
+    """
+    jacobian = problem.jacobian(start)
+    point = point_at(problem, start, along, "start", jacobian)
+    points = [point]
+    values = {kind: test(point.y, point.tangent) for kind, test in tests.items()}
+    bend, step = np.zeros_like(along), _FIRST_STEP * longest
+    while len(points) < most_points:
+
+        def at(length: float, from_: Point = point, bend: FloatArray = bend, near: FloatArray = jacobian) -> FloatArray:
+            guess = from_.y + problem.scale * length * (from_.tangent + 0.5 * length * bend)
+            return correct(problem, guess, from_.tangent, near)
+
+        try:
+            y = at(step)
+            after = problem.jacobian(y)
+            following = point_at(problem, y, point.tangent, "point", after)
+            found = {kind: test(y, following.tangent) for kind, test in tests.items()}
+            if following.tangent @ point.tangent < _LEAST_COSINE:
+                raise BranchEndError("the curve has a corner")
+        except BranchEndError as error:
+            step *= 0.5
+            if step < _SHORTEST * longest:
+                return Branch([*points[:-1], points[-1]._replace(kind="end")], str(error))
+            continue
+        for kind, value in found.items():
+            if value * values[kind] < 0.0:
+                points.append(_located(problem, at, step, tests[kind], kind, point))
+        for index, (low, high, name) in limits.items():
+            if not low <= y[index] <= high:
+                last = _on_limit(problem, point, following, index, low if y[index] < low else high)
+                points = [p for p in points if low <= p.y[index] <= high] + [last]
+                return Branch(points, f"{name} reaches {last.y[index]:g}")
+        if len(points) > 3 and np.linalg.norm((y - start) / problem.scale) < 0.5 * step:
+            return Branch([*points, following._replace(kind="end")], "the curve is closed")
+        points.append(following)
+        bend = (following.tangent - point.tangent) / step
+        point, jacobian, values = following, after, found
+        step = min(longest, 1.5 * step)
+    return Branch(points, f"left after {most_points} points")
+
+
+def _located(
+    problem: Problem, at: Callable[[float], FloatArray], step: float, test: Test, kind: str, before: Point
+) -> Point:
+    """Return the zero of a test within a step; its residual includes that of the test."""
+
+    def value(length: float) -> float:
+        y = at(length)
+        return test(y, point_at(problem, y, before.tangent).tangent)
+
+    try:
+        point = point_at(problem, at(float(brentq(value, 0.0, step, xtol=1e-15, rtol=1e-14))), before.tangent, kind)
+    except (BranchEndError, ValueError):
+        return before._replace(kind=kind, residual=np.inf)
+    return point._replace(residual=max(point.residual, abs(test(point.y, point.tangent))))
+
+
+def _on_limit(problem: Problem, inside: Point, outside: Point, index: int, limit: float) -> Point:
+    try:
+        y = solution_at(problem, inside.y, outside.y, index, limit)
+        return point_at(problem, y, inside.tangent, "end")
+    except BranchEndError:
+        return inside._replace(kind="end")
+
+
+def solution_at(problem: Problem, y0: FloatArray, y1: FloatArray, index: int, value: float) -> FloatArray:
+    """Return the solution between two where an unknown has a value.
+
+    Raises:
+        BranchEndError: if the iteration does not converge.
+    """
+    guess = y0 + (value - y0[index]) / (y1[index] - y0[index]) * (y1 - y0) if y1[index] != y0[index] else y0.copy()
+    guess[index] = value
+    return correct(problem, guess, np.eye(len(guess))[index])

@@ -3,27 +3,34 @@
 The curves are followed by :mod:`sd_friction_env.physics.continuation`; the attractors of a point in each region name it.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
 from sd_friction_env.physics.chunks import Columns, Engine, run_chunks
-from sd_friction_env.physics.continuation import Branch, BranchEndError, FloatArray, follow, solution_at
+from sd_friction_env.physics.continuation import Branch, BranchEndError, FloatArray, Point, follow, solution_at
 from sd_friction_env.physics.orbits import OrbitError, attractors
 from sd_friction_env.physics.orbits.balance import check_unexcited
 from sd_friction_env.physics.orbits.boundaries import Border, FoldBorder, GrazingBorder, HopfBorder, NoBorderError
-from sd_friction_env.physics.parameters import RANGES, OscillatorParameters, brief_repr, checked_count, checked_number
+from sd_friction_env.physics.parameters import (
+    RANGES,
+    OscillatorParameters,
+    brief_repr,
+    checked_choice,
+    checked_count,
+    checked_number,
+)
 from sd_friction_env.physics.tables import Table
 
 BORDERS: dict[str, type[Border]] = {"v_b0": GrazingBorder, "v_b1": HopfBorder, "fold": FoldBorder}
 _STARTS = 5  # values of the second parameter at which curves are looked for
 _COLUMNS = 301  # values of it at which regions are told apart
-_REGIONS = {"stick-slip": "stick-slip", "pure-slip": "pure slip", "steady-slip": "steady slip", "neutral": "neutral"}
+_NAMES = {"stick-slip": "stick-slip", "pure-slip": "pure slip", "steady-slip": "steady slip", "neutral": "neutral"}
 _LEAST_BELT_SPEED = 1e-3
 
 
@@ -73,21 +80,26 @@ def stability_chart(
     points = checked_count("points", points, 10, 100_000)
     starts = tuple(sorted({*np.linspace(low, high, _STARTS).tolist(), min(max(parameters.values[name], low), high)}))
     requests = [Request(parameters, curve, name, low, high, points, starts) for curve in ("v_b0", "v_b1")]
-    description = {"what": "chart", "parameters": dataclasses.asdict(parameters), "over": [name, low, high]}
-    description |= {"points": points}
-    parts = run_chunks(_curve, requests, engine or Engine(), description=description)
-    rows = [row for part in parts for row in Table(part).rows()]
-    near = [row[name] + side * 0.01 * (high - low) for row in rows for side in (-1, 1) if row["kind"] in _FOLD_ENDS]
-    candidates = tuple(p for p in (*starts, *near) if low <= p <= high)
-    folds = list(Table(_curve(requests[0]._replace(curve="fold", starts=candidates))).rows())
-    rows += [row for row in folds if row["kind"] != "none"]
-    rows += _meetings(rows, requests[0])
-    rows += _regions(rows, parameters, name)
     metadata = {"parameters": dataclasses.asdict(parameters), "over": name, "against": against}
-    return Table({column: [row[column] for row in rows] for column in rows[0]}, metadata)
-
-
-_FOLD_ENDS = ("Bautin", "grazing fold")
+    description = {"what": "chart", **metadata, "range": [low, high], "points": points}
+    parts = run_chunks(_curve, requests, engine or Engine(), description=description)
+    near = [
+        value + side * 0.01 * (high - low)
+        for part in parts
+        for value in part[name][np.isin(part["kind"], ("Bautin", "grazing fold"))].tolist()
+        for side in (-1.0, 1.0)
+    ]
+    starts += tuple(value for value in near if low < value < high)
+    folds = _curve(requests[0]._replace(curve="fold", starts=starts))
+    parts.append({column: values[folds["kind"] != "none"] for column, values in folds.items()})
+    curves = Table({column: np.concatenate([part[column] for part in parts]) for column in parts[0]}, metadata)
+    regions = _regions(curves, parameters)
+    return Table(
+        {column: np.append(values, [row[column] for row in regions]) for column, values in curves.items()}
+        if regions
+        else curves,
+        metadata,
+    )
 
 
 def _checked(parameters: Any, over: Any, against: Any) -> tuple[str, float, float]:
@@ -96,14 +108,9 @@ def _checked(parameters: Any, over: Any, against: Any) -> tuple[str, float, floa
     check_unexcited(parameters)
     if not isinstance(over, tuple | list) or len(over) != 3 or not isinstance(over[0], str):
         raise TypeError(f"over must be (name, low, high), got {brief_repr(over)}")
-    if against != "belt_speed":
-        raise ValueError(f"against must be 'belt_speed', got {brief_repr(against)}")
-    name = over[0]
-    allowed = [known for known in parameters.values if known != "belt_speed"]
-    if name not in allowed:
-        raise ValueError(f"over must name one of {', '.join(allowed)}, got {name!r}")
-    least, most = RANGES.get(name, (-1e12, 1e12))
-    low, high = (checked_number(f"over: {name}", value, least, most) for value in over[1:])
+    checked_choice("against", against, ("belt_speed",))
+    name = checked_choice("over", over[0], tuple(known for known in parameters.values if known != "belt_speed"))
+    low, high = (checked_number(f"over, {name},", value, *RANGES.get(name, (-1e12, 1e12))) for value in over[1:])
     if not low < high:
         raise ValueError(f"over must be (name, low, high) with low < high, got {over!r}")
     return name, low, high
@@ -114,152 +121,71 @@ def _checked(parameters: Any, over: Any, against: Any) -> tuple[str, float, floa
 
 def _curve(request: Request) -> Columns:
     """Return the rows of a curve: all its branches that pass one of the starts."""
-    parameters, curve, name = request.parameters, request.curve, request.name
     rows: list[dict[str, Any]] = []
-    followed: list[tuple[Border, list[FloatArray]]] = []
+    followed: list[tuple[Border, list[Point]]] = []
     for value in request.starts:
-        border = _border(request)
-        y = np.array([parameters.belt_speed, value])
+        scale = np.array([1.0, 10.0, 1.0, request.high - request.low])
+        kind = BORDERS[request.curve]
+        scale = scale[[0, 2, 3]] if kind is HopfBorder else scale
+        border: Any = kind(request.parameters, ("belt_speed", request.name), scale)
+        y = np.array([request.parameters.belt_speed, value])
         try:
             border.oscillator(y)
             if not border.directions(y)[1].any():
-                raise NoBorderError(f"the plant does not use the parameter {name!r}")
+                raise NoBorderError(f"the plant does not use the parameter {request.name!r}")
             y = border.start(y)
         except (NoBorderError, BranchEndError, OrbitError) as error:
-            rows.append(_row(curve, name, y, "none", reason=str(error)))
+            rows.append(_row(request.curve, request.name, "none", (math.nan, value), reason=str(error)))
             continue
         if any(_passes(other, places, y) for other, places in followed):
             continue
         back, forth = (_branch(request, border, y, way) for way in (-1.0, 1.0))
-        reasons = {0: back.reason, len(back.points) + len(forth.points) - 2: forth.reason}
         places = [*reversed(back.points[1:]), *forth.points]
-        followed.append((border, [point.y for point in places]))
+        if len(places) > 1:  # a start on an end is not listed twice
+            ends = (places[0].y, places[-1].y)
+            places = [p for p in places if p.kind != "start" or not any(np.allclose(p.y, end) for end in ends)]
+        reasons = {0: back.reason, len(places) - 1: forth.reason}
+        followed.append((border, places))
         for i, point in enumerate(places):
-            rows.append(
-                _row(curve, name, point.y, point.kind, border, point.residual, reasons.get(i, ""), len(followed) - 1)
-            )
+            row = _row(request.curve, request.name, point.kind, point.y[-2:], point.residual, reasons.get(i, ""))
+            row |= {"branch": len(followed) - 1, "x": float(point.y[0]), "crossings": getattr(border, "events", 0)}
+            row["period"] = border.period(point.y) if kind is HopfBorder else float(point.y[1])
+            row["multiplier"] = 1.0 if kind is FoldBorder else 1.0 + point.values.get("grazing fold", math.nan)
+            row["first_lyapunov_coefficient"] = point.values.get("Bautin", math.nan)
+            rows.append(row)
     return {column: np.array([row[column] for row in rows]) for column in rows[0]}
 
 
-def _border(request: Request) -> Any:
-    scale = np.array([1.0, 10.0, 1.0, request.high - request.low])
-    kind = BORDERS[request.curve]
-    return kind(request.parameters, ("belt_speed", request.name), scale[[0, 2, 3]] if kind is HopfBorder else scale)
-
-
 def _branch(request: Request, border: Any, start: FloatArray, way: float) -> Branch:
-    def valid(y: FloatArray, tangent: FloatArray) -> float:
-        border.oscillator(y)
-        return 1.0
-
-    tests = {"turn": lambda y, tangent: float(tangent[-1]), "valid": valid}
+    tests: dict[str, Any] = {"turn": lambda y, tangent: float(tangent[-1])}
     if request.curve == "v_b0":
-        tests["grazing fold"] = lambda y, tangent: border.multiplier(y) - 1.0
+        tests |= {"grazing fold": lambda y, _: border.multiplier(y) - 1.0, "meeting": lambda y, _: border.damping(y)}
     elif request.curve == "v_b1":
-        tests["Bautin"] = lambda y, tangent: border.lyapunov(y)
+        tests["Bautin"] = lambda y, _: border.lyapunov(y) if border.oscillator(y) else math.nan
     least = 0.0 if request.curve == "v_b1" else _LEAST_BELT_SPEED
     limits = {-1: (request.low, request.high, request.name), -2: (least, RANGES["belt_speed"][1], "belt_speed")}
     along = way * np.eye(len(start))[-1]
     return follow(border, start, along, longest=1.0 / request.points, limits=limits, tests=tests)
 
 
-def _passes(border: Any, places: list[FloatArray], y: FloatArray) -> bool:
+def _passes(border: Any, places: list[Point], y: FloatArray) -> bool:
     """Return whether a curve passes a solution."""
-    for y0, y1 in itertools.pairwise(places):
-        if (y0[-1] - y[-1]) * (y1[-1] - y[-1]) <= 0.0:
-            try:
-                found = solution_at(border, y0, y1, len(y) - 1, y[-1])
-            except BranchEndError:
-                continue
-            if abs(found[-2] - y[-2]) < 1e-7 * max(1.0, y[-2]):
-                return True
+    for before, after in itertools.pairwise(point.y for point in places):
+        if (before[-1] - y[-1]) * (after[-1] - y[-1]) <= 0.0:
+            with contextlib.suppress(BranchEndError):
+                found = solution_at(border, before, after, len(y) - 1, y[-1])
+                if abs(found[-2] - y[-2]) < 1e-7 * max(1.0, y[-2]):
+                    return True
     return False
 
 
 def _row(
-    curve: str,
-    name: str,
-    y: FloatArray,
-    kind: str,
-    border: Any = None,
-    residual: float = math.nan,
-    reason: str = "",
-    branch: int = -1,
+    curve: str, name: str, kind: str, place: Iterable[float], residual: float = math.nan, reason: str = ""
 ) -> dict[str, Any]:
-    is_hopf, is_graze = (isinstance(border, one) for one in (HopfBorder, GrazingBorder))
-    if is_hopf:
-        stiffness = border.jacobian(y)[0, 0]
-        period = 2.0 * math.pi / math.sqrt(stiffness) if stiffness > 0.0 else math.nan
-    return {
-        "curve": curve,
-        "branch": branch,
-        "kind": kind,
-        name: float(y[-1]),
-        "belt_speed": float(y[-2]) if border is not None or curve == "region" else math.nan,
-        "x": float(y[0]) if border is not None else math.nan,
-        "period": period if is_hopf else float(y[1]) if border is not None else math.nan,
-        "residual": residual,
-        "multiplier": border.multiplier(y) if is_graze else math.nan,
-        "first_lyapunov_coefficient": border.lyapunov(y) if is_hopf else math.nan,
-        "crossings": getattr(border, "events", 0),
-        "reason": reason,
-    }
-
-
-def _branches(rows: list[dict[str, Any]], name: str) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """Yield each branch's curve and points."""
-    on_curves = [row for row in rows if row["branch"] >= 0]
-    for (curve, _), group in itertools.groupby(on_curves, key=lambda row: (row["curve"], row["branch"])):
-        yield curve, list(group)
-
-
-def _meetings(rows: list[dict[str, Any]], request: Request) -> list[dict[str, Any]]:
-    """Return the points where v_b0 = v_b1."""
-    name = request.name
-    found = []
-    branches = list(_branches(rows, name))
-    for (one, grazing), (other, hopf) in itertools.product(branches, branches):
-        if (one, other) != ("v_b0", "v_b1"):
-            continue
-        for a0, a1 in itertools.pairwise(grazing):
-            for b0, b1 in _crossing(a0, a1, hopf, name):
-                borders = _border(request), _border(request._replace(curve="v_b1"))
-                borders[0].events = a0["crossings"]
-                ends = [(np.array([r["x"], r["period"], r["belt_speed"], r[name]]) for r in (a0, a1))]
-                ends.append(np.array([r["x"], r["belt_speed"], r[name]]) for r in (b0, b1))
-                pairs = [tuple(pair) for pair in ends]
-
-                def solutions(value: float, borders: Any = borders, pairs: Any = pairs) -> list[FloatArray]:
-                    return [solution_at(b, *pair, -1, value) for b, pair in zip(borders, pairs, strict=True)]
-
-                def apart(value: float, solutions: Any = solutions) -> float:
-                    graze, hopf = solutions(value)
-                    return float(graze[-2] - hopf[-2])
-
-                low = max(min(a0[name], a1[name]), min(b0[name], b1[name]))
-                high = min(max(a0[name], a1[name]), max(b0[name], b1[name]))
-                value = float(brentq(apart, low, high, xtol=1e-15, rtol=1e-14))
-                y = solutions(value)[0]
-                found.append(_row("v_b0", name, y, "meeting", borders[0], abs(apart(value))))
-    return found
-
-
-def _crossing(
-    a0: dict[str, Any], a1: dict[str, Any], hopf: list[dict[str, Any]], name: str
-) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Yield the pieces of one curve that cross a piece of another, over the values that they share."""
-    for b0, b1 in itertools.pairwise(hopf):
-        low = max(min(a0[name], a1[name]), min(b0[name], b1[name]))
-        high = min(max(a0[name], a1[name]), max(b0[name], b1[name]))
-        if low < high:
-            gaps = [_between(a0, a1, value, name) - _between(b0, b1, value, name) for value in (low, high)]
-            if gaps[0] * gaps[1] < 0.0:
-                yield b0, b1
-
-
-def _between(r0: dict[str, Any], r1: dict[str, Any], value: float, name: str) -> float:
-    share = (value - r0[name]) / (r1[name] - r0[name])
-    return float(r0["belt_speed"] + share * (r1["belt_speed"] - r0["belt_speed"]))
+    speed, value = map(float, place)
+    row: dict[str, Any] = {"curve": curve, "branch": -1, "kind": kind, name: value, "belt_speed": speed}
+    row |= dict.fromkeys(("x", "period", "residual", "multiplier", "first_lyapunov_coefficient"), math.nan)
+    return row | {"residual": residual, "crossings": 0, "reason": reason}
 
 
 # Regions --------------------------------------------------------------------------------------------------------------
@@ -272,46 +198,48 @@ class Slab(NamedTuple):
     bounds: FloatArray
 
 
-def slabs_of(rows: list[dict[str, Any]], name: str) -> list[Slab]:
-    """Return the chart cut where a curve begins, ends, turns or crosses another; the first bound is 0, the last the
-    top of the chart."""
-    branches = list(_branches(rows, name))
+def slabs_of(chart: Table) -> list[Slab]:
+    """Return a chart cut where a curve begins, ends, turns or crosses another, from belt speed 0 to the top."""
+    over = chart[chart.metadata["over"]]
+    keys = [(str(curve), int(branch)) for curve, branch in zip(chart["curve"], chart["branch"], strict=True)]
+    branches = []
+    for key in dict.fromkeys(key for key in keys if key[1] >= 0):
+        chosen = [i for i, other in enumerate(keys) if other == key]
+        branches.append((key, over[chosen], chart["belt_speed"][chosen]))
     if not branches:
         return []
-    top = 1.15 * max(row["belt_speed"] for _, points in branches for row in points)
-    every = [row[name] for row in rows if math.isfinite(row[name])]
-    columns: list[tuple[tuple[str, ...], float, list[float]]] = []
-    for value in np.linspace(min(every), max(every), _COLUMNS).tolist():
+    top = 1.15 * max(float(speeds.max()) for _, _, speeds in branches)
+    columns = []
+    for value in np.linspace(over.min(), over.max(), _COLUMNS + 2)[1:-1].tolist():
         met = []
-        for curve, points in branches:
-            for r0, r1 in itertools.pairwise(points):
-                if (r0[name] - value) * (r1[name] - value) <= 0.0 and r0[name] != r1[name]:
-                    at = _between(r0, r1, value, name)
-                    if not any(abs(at - other) < 1e-9 for other, _ in met):
-                        met.append((at, curve))
+        for key, p, speeds in branches:
+            for i in np.flatnonzero((p[:-1] <= value) != (p[1:] <= value)).tolist():
+                share = (value - p[i]) / (p[i + 1] - p[i])
+                met.append((float(speeds[i] + share * (speeds[i + 1] - speeds[i])), key))
         met.sort()
-        columns.append((tuple(curve for _, curve in met), value, [0.0, *(at for at, _ in met), top]))
+        columns.append((value, [0.0, *(speed for speed, _ in met), top], [key for _, key in met]))
     found = []
-    for _, group in itertools.groupby(columns, key=lambda column: column[0]):
-        _, values, bounds = zip(*group, strict=True)
+    for _, group in itertools.groupby(columns, key=lambda column: column[2]):
+        values, bounds, _ = zip(*group, strict=True)
         found.append(Slab(np.array(values), np.array(bounds).T))
     return found
 
 
-def _regions(rows: list[dict[str, Any]], parameters: OscillatorParameters, name: str) -> list[dict[str, Any]]:
+def _regions(chart: Table, parameters: OscillatorParameters) -> list[dict[str, Any]]:
     """Return a row for each region: a point in it and its name."""
-    found = []
-    for slab in slabs_of(rows, name):
+    name, found = chart.metadata["over"], []
+    for slab in slabs_of(chart):
         middle = len(slab.values) // 2
         value = float(slab.values[middle])
-        found.append(_row("region", name, np.array([math.nan, 0.0, value]), "rest", reason="the belt stands still"))
+        found.append(_row("region", name, "rest", (0.0, value), reason="the belt stands still"))
         for low, high in itertools.pairwise(slab.bounds[:, middle].tolist()):
-            speed, kinds, reason = 0.5 * (low + high), ["none"], ""
+            speed, kind = 0.5 * (low + high), "none"
             try:
-                kinds = sorted({cycle.kind for cycle in attractors(parameters.replace(**{name: value}, belt_speed=speed))})
-                reason = ", ".join(kinds) or "no attractor that keeps contact"
+                cycles = attractors(parameters.replace(**{name: value}, belt_speed=speed))
+                kinds = sorted({cycle.kind for cycle in cycles})
+                reason = " and ".join(kinds) or "no attractor that keeps contact"
+                kind = "bistable" if len(kinds) > 1 else _NAMES.get(reason, "none")
             except ValueError as error:
                 reason = str(error)
-            kind = "bistable" if len(kinds) > 1 else _REGIONS.get(kinds[0] if kinds else "", "none")
-            found.append(_row("region", name, np.array([math.nan, speed, value]), kind, reason=reason))
+            found.append(_row("region", name, kind, (speed, value), reason=reason))
     return found

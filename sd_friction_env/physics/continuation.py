@@ -38,11 +38,12 @@ class Problem(Protocol):
 
 
 class Point(NamedTuple):
-    """A point of a curve: the unknowns, the scaled unit tangent, the largest residual, and what is special about it."""
+    """A point of a curve: unknowns, scaled unit tangent, largest residual, values of the tests, what is special."""
 
     y: FloatArray
     tangent: FloatArray
     residual: float
+    values: dict[str, float]
     kind: str = "point"
 
 
@@ -85,13 +86,15 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         raise BranchEndError("the curve is singular here") from None
 
 
-def point_at(
-    problem: Problem, y: FloatArray, along: FloatArray, kind: str = "point", jacobian: FloatArray | None = None
+def _point(
+    problem: Problem, y: FloatArray, along: FloatArray, tests: Mapping[str, Test], jacobian: FloatArray | None = None
 ) -> Point:
     """Return a solution as a point whose tangent leads the way of ``along``."""
     jacobian = problem.jacobian(y) if jacobian is None else jacobian
     tangent = _solved(np.vstack((jacobian * problem.scale, along)), np.append(np.zeros(len(jacobian)), 1.0))
-    return Point(y, tangent / np.linalg.norm(tangent), float(np.abs(problem.residual(y)).max()), kind)
+    tangent = tangent / np.linalg.norm(tangent)
+    residual = float(np.abs(problem.residual(y)).max())
+    return Point(y, tangent, residual, {kind: test(y, tangent) for kind, test in tests.items()})
 
 
 def follow(
@@ -116,67 +119,65 @@ def follow(
         most_points: after which the curve is left.
     """
     jacobian = problem.jacobian(start)
-    point = point_at(problem, start, along, "start", jacobian)
+    point = _point(problem, start, along, tests, jacobian)._replace(kind="start")
     points = [point]
-    values = {kind: test(point.y, point.tangent) for kind, test in tests.items()}
     bend, step = np.zeros_like(along), _FIRST_STEP * longest
     while len(points) < most_points:
 
-        def at(length: float, from_: Point = point, bend: FloatArray = bend, near: FloatArray = jacobian) -> FloatArray:
-            guess = from_.y + problem.scale * length * (from_.tangent + 0.5 * length * bend)
-            return correct(problem, guess, from_.tangent, near)
+        def at(length: float, point: Point = point, bend: FloatArray = bend, near: FloatArray = jacobian) -> FloatArray:
+            guess = point.y + problem.scale * length * (point.tangent + 0.5 * length * bend)
+            return correct(problem, guess, point.tangent, near)
 
         try:
-            y = at(step)
+            y, reason, length = at(step), "", step
+            for index, (low, high, name) in limits.items():
+                if not low <= y[index] <= high:
+                    y = solution_at(problem, point.y, y, index, low if y[index] < low else high)
+                    reason, length = f"{name} reaches {y[index]:g}", point.tangent @ ((y - point.y) / problem.scale)
             after = problem.jacobian(y)
-            following = point_at(problem, y, point.tangent, "point", after)
-            found = {kind: test(y, following.tangent) for kind, test in tests.items()}
+            following = _point(problem, y, point.tangent, tests, after)
             if following.tangent @ point.tangent < _LEAST_COSINE:
                 raise BranchEndError("the curve has a corner")
+            points += [
+                _located(problem, at, float(length), tests, kind, point)
+                for kind, value in following.values.items()
+                if value * point.values[kind] < 0.0
+            ]
         except BranchEndError as error:
             step *= 0.5
             if step < _SHORTEST * longest:
                 return Branch([*points[:-1], points[-1]._replace(kind="end")], str(error))
             continue
-        for kind, value in found.items():
-            if value * values[kind] < 0.0:
-                points.append(_located(problem, at, step, tests[kind], kind, point))
-        for index, (low, high, name) in limits.items():
-            if not low <= y[index] <= high:
-                last = _on_limit(problem, point, following, index, low if y[index] < low else high)
-                points = [p for p in points if low <= p.y[index] <= high] + [last]
-                return Branch(points, f"{name} reaches {last.y[index]:g}")
-        if len(points) > 3 and np.linalg.norm((y - start) / problem.scale) < 0.5 * step:
-            return Branch([*points, following._replace(kind="end")], "the curve is closed")
+        if not reason and len(points) > 3 and np.linalg.norm((y - start) / problem.scale) < 0.5 * step:
+            reason = "the curve is closed"
+        if reason:
+            return Branch([*points, following._replace(kind="end")], reason)
         points.append(following)
         bend = (following.tangent - point.tangent) / step
-        point, jacobian, values = following, after, found
+        point, jacobian = following, after
         step = min(longest, 1.5 * step)
     return Branch(points, f"left after {most_points} points")
 
 
 def _located(
-    problem: Problem, at: Callable[[float], FloatArray], step: float, test: Test, kind: str, before: Point
+    problem: Problem,
+    at: Callable[[float], FloatArray],
+    step: float,
+    tests: Mapping[str, Test],
+    kind: str,
+    before: Point,
 ) -> Point:
     """Return the zero of a test within a step; its residual includes that of the test."""
 
-    def value(length: float) -> float:
-        y = at(length)
-        return test(y, point_at(problem, y, before.tangent).tangent)
+    def point(length: float) -> Point:
+        return _point(problem, at(length), before.tangent, tests)
 
     try:
-        point = point_at(problem, at(float(brentq(value, 0.0, step, xtol=1e-15, rtol=1e-14))), before.tangent, kind)
-    except (BranchEndError, ValueError):
-        return before._replace(kind=kind, residual=np.inf)
-    return point._replace(residual=max(point.residual, abs(test(point.y, point.tangent))))
-
-
-def _on_limit(problem: Problem, inside: Point, outside: Point, index: int, limit: float) -> Point:
-    try:
-        y = solution_at(problem, inside.y, outside.y, index, limit)
-        return point_at(problem, y, inside.tangent, "end")
-    except BranchEndError:
-        return inside._replace(kind="end")
+        length = brentq(lambda length: point(length).values[kind], 0.0, step, xtol=1e-15, rtol=1e-14)
+    except ValueError:
+        raise BranchEndError(f"the test of a {kind} changes sign at the end of a step only") from None
+    found = point(float(length))
+    return found._replace(kind=kind, residual=max(found.residual, abs(found.values[kind])))
 
 
 def solution_at(problem: Problem, y0: FloatArray, y1: FloatArray, index: int, value: float) -> FloatArray:

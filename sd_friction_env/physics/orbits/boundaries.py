@@ -118,9 +118,10 @@ class Border:
         traced = kernel.trace(plant, kernel.SLIP_BACKWARD, state, belt, np.array([time]), sample, met)
         lands = traced.events > events
         if traced.status != kernel.OK or traced.events < events:
-            raise BranchEndError(f"the orbit changes: {kernel.STATUS_NAMES[traced.status]}, {traced.events} events")
+            what = "loses contact" if traced.status == kernel.CONTACT_LOST else "crosses the belt's speed another time"
+            raise BranchEndError(f"the orbit {what}")
         if lands and time - met[events, 0] > _LONGEST_EXTENSION:
-            raise BranchEndError("the orbit sticks before it grazes")
+            raise BranchEndError("the orbit sticks before it is closed")
         mode = kernel.SLIP_BACKWARD if events % 2 == 0 else kernel.SLIP_FORWARD
         columns = 0 if seeds is None else seeds.shape[1]
         if seeds is None or not columns:
@@ -220,6 +221,13 @@ class HopfBorder(Border):
             else:
                 columns.append(gradients @ changes[i] if self.exact else self.by_differences(y, 1 + i))
         return np.column_stack(columns)
+
+    def period(self, y: FloatArray) -> float:
+        """Return the period of small orbits at the Hopf point, NaN where the equilibrium is a saddle."""
+        plant, speed = self.at(y)
+        mu = plant.friction.coefficient(kernel.SLIP_BACKWARD, -speed)
+        stiffness = plant.spring.restoring_slope(y[0]) + mu * plant.spring.normal_slope(y[0])
+        return 2.0 * math.pi / math.sqrt(stiffness) if stiffness > 0.0 else math.nan
 
     def lyapunov(self, y: FloatArray) -> float:
         """Return the first Lyapunov coefficient."""
@@ -336,6 +344,11 @@ class GrazingBorder(Border):
         Above 1 the pure-slip cycle that ends at the graze is unstable, and lies below v_b0 beside stick-slip.
         """
         return float(self.lap(y).by[1, 0])
+
+    def damping(self, y: FloatArray) -> float:
+        """Return the damping of steady slip there: where it is 0, v_b0 = v_b1."""
+        points = equilibria(self.oscillator(y))
+        return points[-1].damping if points else math.nan
 
     def lap(self, y: FloatArray) -> End:
         """Return the lap from the graze with the derivatives by v there; it ends at its greatest speed."""

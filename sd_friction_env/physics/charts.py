@@ -1,6 +1,6 @@
 """Charts of stability over two parameters: where stick-slip ends, where steady slip loses stability, what lies between.
 
-The curves are followed by :mod:`sd_friction_env.physics.continuation`; the attractors of a point in each region name it.
+The curves are followed by :mod:`sd_friction_env.physics.continuation`; attractors at a point of each region name it.
 """
 
 import contextlib

@@ -65,7 +65,8 @@ def correct(problem: Problem, guess: FloatArray, row: FloatArray, jacobian: Floa
     Raises:
         BranchEndError: if the iteration does not converge.
     """
-    y, before = guess.copy(), np.inf
+    y: FloatArray = guess.copy()
+    before = np.inf
     for _ in range(_MOST_CORRECTIONS):
         residual = problem.residual(y)
         size = float(np.abs(residual).max())
@@ -81,7 +82,7 @@ def correct(problem: Problem, guess: FloatArray, row: FloatArray, jacobian: Floa
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
     try:
-        return np.linalg.solve(matrix, right)
+        return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
     except np.linalg.LinAlgError:
         raise BranchEndError("the curve is singular here") from None
 
@@ -129,17 +130,20 @@ def follow(
             return correct(problem, guess, point.tangent, near)
 
         try:
-            y, reason, length = at(step), "", step
+            y, reason, length = at(step), "", float(step)
             for index, (low, high, name) in limits.items():
                 if not low <= y[index] <= high:
                     y = solution_at(problem, point.y, y, index, low if y[index] < low else high)
-                    reason, length = f"{name} reaches {y[index]:g}", point.tangent @ ((y - point.y) / problem.scale)
+                    reason, length = (
+                        f"{name} reaches {y[index]:g}",
+                        float(point.tangent @ ((y - point.y) / problem.scale)),
+                    )
             after = problem.jacobian(y)
             following = _point(problem, y, point.tangent, tests, after)
             if following.tangent @ point.tangent < _LEAST_COSINE:
                 raise BranchEndError("the curve has a corner")
             points += [
-                _located(problem, at, float(length), tests, kind, point)
+                _located(problem, at, length, tests, kind, point)
                 for kind, value in following.values.items()
                 if value * point.values[kind] < 0.0
             ]

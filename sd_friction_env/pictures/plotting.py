@@ -355,7 +355,7 @@ def draw_chart(axis: "Axes", chart: Table) -> None:
     name = chart.metadata["over"]
     over, speeds = chart[name], chart["belt_speed"]
     kinds = iter(chart["kind"][(chart["curve"] == "region") & (chart["kind"] != "rest")].tolist())
-    handles = {}
+    handles: dict[str, Any] = {}
     for slab in slabs_of(chart):
         for low, high in zip(slab.bounds, slab.bounds[1:], strict=False):
             kind = next(kinds)
@@ -368,8 +368,8 @@ def draw_chart(axis: "Axes", chart: Table) -> None:
     for kind, marker in (("turn", "s"), ("Bautin", "D"), ("grazing fold", "^"), ("meeting", "o")):
         part = chart["kind"] == kind
         if part.any():
-            style = {"linestyle": "none", "color": BLACK, "marker": marker, "markersize": 5.5, "label": kind}
-            handles[kind] = axis.plot(over[part], speeds[part], **style)[0]  # type: ignore[arg-type]
+            mark: dict[str, Any] = {"linestyle": "none", "color": BLACK, "markersize": 5.5, "label": kind}
+            handles[kind] = axis.plot(over[part], speeds[part], marker=marker, **mark)[0]
     axis.set_ylim(bottom=0.0)
     axis.margins(x=0.0, y=0.0)
     axis.set_xlabel(label_of(name))

@@ -23,6 +23,7 @@ from sd_friction_env.physics.theory import FloatArray
 _BEFORE_LANDING = 1e-5  # time before a landing at which an orbit that overshoots is left
 _LONGEST_EXTENSION = 1.0  # time by which such an orbit is extended as if it did not land
 _LONGEST_ORBIT = 300.0
+_LEAST_CYCLE = 1e-2  # acceleration at its greatest x below which a fold is taken to be a Bautin point
 _DIFFERENCE = 1e-5  # relative step of differences
 _STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 / 12.0))  # fourth order
 
@@ -88,7 +89,8 @@ class Border:
         """Return a column of the Jacobian by differences."""
         step = np.zeros_like(y)
         step[column] = _DIFFERENCE * max(1e-3, abs(y[column]))
-        return sum(weight * self.residual(y + part * step) for part, weight in _STENCIL) / step[column]
+        parts = [weight * self.residual(y + part * step) for part, weight in _STENCIL]
+        return np.asarray(np.sum(parts, axis=0) / step[column], dtype=np.float64)
 
     def orbit(
         self,
@@ -123,8 +125,8 @@ class Border:
         if lands and time - met[events, 0] > _LONGEST_EXTENSION:
             raise BranchEndError("the orbit sticks before it is closed")
         mode = kernel.SLIP_BACKWARD if events % 2 == 0 else kernel.SLIP_FORWARD
-        columns = 0 if seeds is None else seeds.shape[1]
-        if seeds is None or not columns:
+        columns, changes = 0 if seeds is None else seeds.shape[1], None
+        if seeds is None:
             until = met[events, 0] if lands else time
             end = (met[events, 2], speed) if lands else tuple(sample[0, :2].tolist())
         else:
@@ -149,7 +151,7 @@ class Border:
             stiffness = plant.spring.restoring_slope(x) + mu * plant.spring.normal_slope(x)
             dx, dv = tangents[[kernel.TANGENT_X, kernel.TANGENT_V]]
             da = -stiffness * dx - (2.0 * plant.beta + grip) * dv + grip * on_belt
-            if last:
+            if changes is not None:
                 by_numbers = forces_by_numbers(plant, x, place.v, mu, friction.coefficient_gradient(mode, w))
                 da[len(order) - len(last) :] -= changes @ by_numbers
             by[:, order] = dx + rest * dv, dv + rest * da, da
@@ -205,7 +207,7 @@ class HopfBorder(Border):
         by_speed = np.array([-slope * normal, -plant.friction.curvature(mode, -speed) * normal])
         if self.exact:
             # The derivatives of mu' are those of mu, differentiated by the relative velocity.
-            step, of_slope = _DIFFERENCE * 10.0 * (1.0 + speed), 0.0
+            step, of_slope = _DIFFERENCE * 10.0 * (1.0 + speed), np.zeros(1)
             for part, weight in _STENCIL:
                 of_coefficient = plant.friction.coefficient_gradient(mode, -speed + part * step)
                 of_slope = of_slope + weight / step * np.array(of_coefficient)
@@ -245,7 +247,7 @@ class HopfBorder(Border):
 
 
 class GrazingBorder(Border):
-    """v_b0: the slip from breakaway reaches the belt's speed with no acceleration, in (x of breakaway, time, parameters).
+    """v_b0: the slip from breakaway reaches the belt's speed at no acceleration, in (x of breakaway, time, parameters).
 
     ``events`` is the number of crossings of the belt's speed before.
     """
@@ -257,9 +259,7 @@ class GrazingBorder(Border):
         spring, mu = plant.spring, plant.friction.breakaway_coefficient(kernel.SLIP_BACKWARD)
 
         def missed(x: float) -> float:
-            return float(
-                2.0 * plant.beta * speed + spring.restoring_force(x) - mu * spring.normal_force(plant.g1, x)
-            )
+            return float(2.0 * plant.beta * speed + spring.restoring_force(x) - mu * spring.normal_force(plant.g1, x))
 
         at_x, x0 = missed(x), x
         for _ in range(20):
@@ -379,6 +379,10 @@ class FoldBorder(Border):
 
     def residual(self, y: FloatArray) -> FloatArray:
         """Return by how much x and v = 0 are missed after the lap, and the multiplier less 1."""
+        plant, speed = self.at(y)
+        belt = kernel.Drive(speed, 0.0, 0.0)
+        if kernel.slip_acceleration(plant, kernel.SLIP_BACKWARD, kernel.State(y[0], 0.0), belt) > -_LEAST_CYCLE:
+            raise BranchEndError("the cycle shrinks to the equilibrium: a Bautin point of v_b1")
         end = self.orbit(y, y[0], 0.0, y[1], self.events, np.eye(2))
         return np.array([end.x - y[0], end.v, np.linalg.det(end.by[:2]) - 1.0])
 

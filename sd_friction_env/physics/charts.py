@@ -218,10 +218,11 @@ def slabs_of(chart: Table) -> list[Slab]:
                 met.append((float(speeds[i] + share * (speeds[i + 1] - speeds[i])), key))
         met.sort()
         columns.append((value, [0.0, *(speed for speed, _ in met), top], [key for _, key in met]))
-    found = []
+    found, half = [], 0.5 * float(np.ptp(over)) / (_COLUMNS + 1)
     for _, group in itertools.groupby(columns, key=lambda column: column[2]):
         values, bounds, _ = zip(*group, strict=True)
-        found.append(Slab(np.array(values), np.array(bounds).T))
+        padded = np.pad(np.array(bounds).T, ((0, 0), (1, 1)), "edge")  # up to the next slab
+        found.append(Slab(np.array([values[0] - half, *values, values[-1] + half]), padded))
     return found
 
 

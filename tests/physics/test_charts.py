@@ -9,6 +9,7 @@ import pytest
 from sd_friction_env import OscillatorParameters, friction_law, kernel, limit_cycle, slip_cycles, stability_chart
 from sd_friction_env.physics.continuation import follow
 from sd_friction_env.physics.orbits import NoBorderError, grazing_belt_speed, grazing_map, hopf_belt_speed
+from sd_friction_env.physics.orbits.boundaries import GrazingBorder, HopfBorder
 from sd_friction_env.physics.sweeps import Engine, SweepError
 
 CUBIC = OscillatorParameters(geometry="cubic")
@@ -231,3 +232,14 @@ def test_a_circle_is_followed_through_its_turns():
     assert branch.reason == "the curve is closed"
     turns = np.array([point.y for point in branch.points if point.kind == "turn"])
     assert np.allclose(turns, [[0.0, 1.0], [0.0, -1.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["g1", "beta", "mu_s", "mu_m", "v_m", "alpha"])
+def test_derivatives_of_the_borders_are_those_of_differences(name):
+    scale = np.array([1.0, 10.0, 1.0, 1.0])
+    for kind, sizes in ((GrazingBorder, scale), (HopfBorder, scale[1:])):
+        border = kind(CUBIC, ("belt_speed", name), sizes)
+        y = border.start(np.array([0.2, CUBIC.values[name]]))
+        y[-2] += 5e-3  # the orbit stays below the belt's speed: differences need no landing
+        differences = np.column_stack([border.by_differences(y, column) for column in range(len(y))])
+        assert np.allclose(border.jacobian(y), differences, rtol=1e-6, atol=1e-6)

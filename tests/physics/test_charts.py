@@ -241,5 +241,7 @@ def test_derivatives_of_the_borders_are_those_of_differences(name):
         border = kind(CUBIC, ("belt_speed", name), sizes)
         y = border.start(np.array([0.2, CUBIC.values[name]]))
         y[-2] += 5e-3  # the orbit stays below the belt's speed: differences need no landing
+        if kind is GrazingBorder:
+            y[0], _ = border.breakaway(*border.at(y), y[0])
         differences = np.column_stack([border.by_differences(y, column) for column in range(len(y))])
         assert np.allclose(border.jacobian(y), differences, rtol=1e-6, atol=1e-6)

@@ -19,6 +19,7 @@ from sd_friction_env.physics.orbits.balance import check_unexcited
 from sd_friction_env.physics.orbits.boundaries import Border, FoldBorder, GrazingBorder, HopfBorder, NoBorderError
 from sd_friction_env.physics.parameters import (
     RANGES,
+    STATE_LIMIT,
     OscillatorParameters,
     brief_repr,
     checked_choice,
@@ -134,12 +135,12 @@ def _curve(request: Request) -> Columns:
             if not border.directions(y)[1].any():
                 raise NoBorderError(f"the plant does not use the parameter {request.name!r}")
             y = border.start(y)
+            if any(_passes(other, places, y) for other, places in followed):
+                continue
+            back, forth = (_branch(request, border, y, way) for way in (-1.0, 1.0))
         except (NoBorderError, BranchEndError, OrbitError) as error:
             rows.append(_row(request.curve, request.name, "none", (math.nan, value), reason=str(error)))
             continue
-        if any(_passes(other, places, y) for other, places in followed):
-            continue
-        back, forth = (_branch(request, border, y, way) for way in (-1.0, 1.0))
         places = [*reversed(back.points[1:]), *forth.points]
         if len(places) > 1:  # a start on an end is not listed twice
             ends = (places[0].y, places[-1].y)
@@ -164,6 +165,7 @@ def _branch(request: Request, border: Any, start: FloatArray, way: float) -> Bra
         tests["Bautin"] = lambda y, _: border.lyapunov(y) if border.oscillator(y) else math.nan
     least = 0.0 if request.curve == "v_b1" else _LEAST_BELT_SPEED
     limits = {-1: (request.low, request.high, request.name), -2: (least, RANGES["belt_speed"][1], "belt_speed")}
+    limits[0] = (-STATE_LIMIT, STATE_LIMIT, "x")
     along = way * np.eye(len(start))[-1]
     return follow(border, start, along, longest=1.0 / request.points, limits=limits, tests=tests)
 

@@ -160,7 +160,7 @@ def follow(
         bend = (following.tangent - point.tangent) / step
         point, jacobian = following, after
         step = min(longest, 1.5 * step)
-    return Branch(points, f"left after {most_points} points")
+    return Branch([*points[:-1], points[-1]._replace(kind="end")], f"left after {most_points} points")
 
 
 def _located(

@@ -134,6 +134,9 @@ def test_what_is_not_there_has_a_row_that_says_why():
     reasons = dict(zip(coulomb["curve"].tolist(), coulomb["reason"].tolist(), strict=True))
     assert "persists up to the greatest belt speed" in reasons["v_b0"]
     assert "steady slip is stable" in reasons["v_b1"]
+    soft = LINEAR.replace(geometry="duffing", kappa=-0.5, friction="exponential", mu_s=0.4, mu_k=0.2)
+    softening = stability_chart(soft, ("kappa", -1.5, -0.4), points=10)
+    assert any("is a saddle" in reason for reason in softening["reason"])
     ends = stability_chart(CUBIC, ("mu_m", 0.15, 0.18), points=10)
     assert all(reason for kind, reason in zip(ends["kind"], ends["reason"], strict=True) if kind == "end")
 

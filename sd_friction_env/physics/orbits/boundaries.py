@@ -232,7 +232,9 @@ class HopfBorder(Border):
         return 2.0 * math.pi / math.sqrt(stiffness) if stiffness > 0.0 else math.nan
 
     def lyapunov(self, y: FloatArray) -> float:
-        """Return the first Lyapunov coefficient."""
+        """Return the first Lyapunov coefficient; at a saddle raise BranchEndError."""
+        if not self.period(y) > 0.0:
+            raise BranchEndError("the equilibrium is a saddle, which has no Hopf point")
         return lyapunov_coefficient(*self.at(y), y[0])
 
     def start(self, y: FloatArray) -> FloatArray:

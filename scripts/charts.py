@@ -19,7 +19,7 @@ OVER_ALPHA = ("alpha", 0.2, 1.2)
 SPECIAL: dict[str, tuple[dict[str, Any], tuple[str, float, float]]] = {
     "cubic": ({"geometry": "cubic"}, ("mu_m", 0.0, 0.19)),
     "gaussian": ({"geometry": "linear", "friction": "gaussian", "mu_s": 0.4, "mu_k": 0.2}, ("beta", 0.02, 0.2)),
-    "softening": ({"geometry": "duffing", "friction": "exponential", "mu_s": 0.4, "mu_k": 0.2}, ("kappa", -0.5, 0.5)),
+    "exact": ({}, ("v_m", 0.1, 2.0)),
 }
 
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out f
     from sd_friction_env.environments.wrappers import ScaledReward
     from sd_friction_env.physics import forced, sweeps, theory
     from sd_friction_env.physics.basins import Basins, basin_grid
+    from sd_friction_env.physics.charts import stability_chart
     from sd_friction_env.physics.curves import amplitude_curve, attractor_curves
     from sd_friction_env.physics.laws import (
         Asymmetric,
@@ -74,6 +75,7 @@ _PUBLIC = {
     "ScaledReward": "environments.wrappers",
     "Basins": "physics.basins",
     "basin_grid": "physics.basins",
+    "stability_chart": "physics.charts",
     "amplitude_curve": "physics.curves",
     "attractor_curves": "physics.curves",
     "Asymmetric": "physics.laws",
@@ -152,6 +154,7 @@ __all__ = [
     "simulate",
     "slip_cycles",
     "spring_law",
+    "stability_chart",
     "step_with_jacobian",
     "stick_intervals",
     "sweeps",

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from scripts.figures import basins, chaos, control, paper, rule
+from scripts.figures import basins, chaos, chart, control, paper, rule
 from sd_friction_env import Table
 
 FIGURES: dict[str, tuple[Callable[[], Table], Callable[[Table, Path], None]]] = {
@@ -23,6 +23,7 @@ FIGURES: dict[str, tuple[Callable[[], Table], Callable[[Table, Path], None]]] = 
     "linear": (paper.compute_linear, paper.draw_linear),
     "basins": (basins.compute, basins.draw),
     "chaos": (chaos.compute, chaos.draw),
+    "chart": (chart.compute, chart.draw),
     "control": (control.compute, control.draw),
     "rule": (rule.compute, rule.draw),
 }

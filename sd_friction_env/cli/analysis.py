@@ -1,4 +1,4 @@
-"""Passive and forced analysis: amplitude, cycle, critical, simulate, basins, poincare, lyapunov, bifurcation."""
+"""Passive and forced analysis: amplitude, cycle, critical, chart, simulate, basins, poincare, lyapunov, bifurcation."""
 
 import argparse
 import dataclasses
@@ -34,6 +34,7 @@ from sd_friction_env.cli.options import (
 )
 from sd_friction_env.physics import sweeps
 from sd_friction_env.physics.basins import LOST_CONTACT, UNDECIDED, basin_grid
+from sd_friction_env.physics.charts import stability_chart
 from sd_friction_env.physics.curves import checked_belt_speeds, refined_curve
 from sd_friction_env.physics.forced import lyapunov_exponent, poincare_section
 from sd_friction_env.physics.orbits import critical_belt_speeds, first_lyapunov_coefficient, limit_cycle
@@ -99,6 +100,26 @@ def _critical(options: argparse.Namespace) -> int:
         rows.append(swept | numbers_ | {"hopf": hopf, "reason": speeds.reason})
         show(done)
     emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options)))
+    return 0
+
+
+def _chart(options: argparse.Namespace) -> int:
+    if options.belt_speed is not None:
+        raise UsageError("--belt-speed is an axis of the chart: leave it out")
+    name, text = options.over
+    try:
+        low, high = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise UsageError(f"--over {name}: {text!r} must be LOW:HIGH, two numbers") from None
+    name, against = name.replace("-", "_"), options.against.replace("-", "_")
+    engine = engine_of(options)
+    chart = stability_chart(one_of(options), (name, low, high), against, points=options.points, engine=engine)
+    chart.metadata = metadata_of(options) | chart.metadata
+    emit(options, chart)
+    if options.plot is not None:
+        figure, axes = plotting.new_figure(6.4, 4.4, 1, 1)
+        plotting.draw_chart(axes[0, 0], chart)
+        plotting.save_figure(figure, options.plot)
     return 0
 
 
@@ -228,6 +249,16 @@ def _add_critical(parser: argparse.ArgumentParser) -> None:
     add_output(parser, None)
 
 
+def _add_chart(parser: argparse.ArgumentParser) -> None:
+    text = "the second parameter and its range, such as alpha 0.1:1.2"
+    parser.add_argument("--over", nargs=2, required=True, metavar=("NAME", "LOW:HIGH"), help=text)
+    parser.add_argument("--against", default="belt_speed", metavar="NAME", help="the other axis (default: belt_speed)")
+    text = "least number on a curve over the whole range (default: 200)"
+    parser.add_argument("--points", type=int, default=200, metavar="N", help=text)
+    add_engine(parser)
+    add_output(parser, "the chart: where it squeals")
+
+
 def _add_simulate(parser: argparse.ArgumentParser) -> None:
     add_start(parser)
     parser.add_argument("--t-end", type=float, default=100.0, help="when to end (default: 100)")
@@ -305,6 +336,12 @@ COMMANDS = {
     "cycle": _command(_add_cycle, _cycle, "", "--geometry cubic --belt-speed 0.405 --json", "--alpha 0.2 --start -1 0"),
     "critical": _command(
         _add_critical, _critical, "", "--geometry cubic exact linear --alpha 0.2:0.8:0.1", "--mu-m 0.1575 --json"
+    ),
+    "chart": _command(
+        _add_chart,
+        _chart,
+        "--over alpha 0.1:1.2 --against belt_speed --plot chart.png --out chart.csv",
+        "--friction gaussian --geometry linear --over beta 0.02:0.1 --plot chart.png",
     ),
     "simulate": _command(
         _add_simulate,

@@ -22,6 +22,7 @@ _COMMANDS = {
     "amplitude": ("analysis", "plot", "amplitude, period and kind of motion over the belt speed"),
     "cycle": ("analysis", "plot", "the limit cycle that one start reaches"),
     "critical": ("analysis", "plot", "belt speeds at which stick-slip (v_b0) and oscillation (v_b1) end"),
+    "chart": ("analysis", "plot", "where it squeals: v_b0, v_b1 and the regions between over a second parameter"),
     "simulate": ("analysis", "plot", "one history in time"),
     "basins": ("analysis", "plot", "the attractor that each start of a grid reaches"),
     "poincare": ("analysis", "plot", "the state once per drive period of a forced motion"),

@@ -42,7 +42,7 @@ class EntryError(ValueError):
 
 @dataclass
 class Checked:
-    """A policy whose actions are checked and timed.
+    """A policy whose actions are checked.
 
     Attributes:
         policy: acts. name, env_id: for messages. progress: called after each decision.

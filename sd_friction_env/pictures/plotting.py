@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env.extras import extra
 from sd_friction_env.physics.basins import Basins
+from sd_friction_env.physics.charts import slabs_of
 from sd_friction_env.physics.forced import ForcedBasins
 from sd_friction_env.physics.orbits import LimitCycle
 from sd_friction_env.physics.simulation import Trajectory
@@ -47,6 +48,19 @@ CONTROLLED = (
     {"marker": "^", "markersize": 11.0, "color": GREEN, "markerfacecolor": "none", "zorder": 3},
 )
 WAYS = {"up": ORANGE, "down": BLACK}
+REGIONS = {
+    "stick-slip": "#A6CEE3",
+    "pure slip": "#FDD9B5",
+    "bistable": "#DDC7E8",
+    "neutral": "#B9E3C6",
+    "steady slip": "#F5F5F5",
+    "none": "#BBBBBB",
+}
+BORDERS = {
+    "v_b0": {"color": BLUE, "linestyle": "-", "label": "$v_{b0}$: stick ends (grazing)"},
+    "v_b1": {"color": VERMILION, "linestyle": (0, (4, 1.2)), "label": "$v_{b1}$: steady slip unstable (Hopf)"},
+    "fold": {"color": BLACK, "linestyle": (0, (1, 1)), "label": "fold of pure-slip cycles"},
+}
 LABELS = {
     "alpha": r"anchor height $\alpha$",
     "g1": "weight $g_1$",
@@ -339,6 +353,36 @@ def draw_bifurcation(axis: "Axes", diagram: Table) -> None:
     axis.set_xlabel(label_of(diagram.metadata["swept"]))
     axis.set_ylabel("$x$ on the section")
     axis.legend(fontsize=8, frameon=False, loc="best")
+
+
+@house_style()
+def draw_chart(axis: "Axes", chart: Table) -> None:
+    """Draw a chart of :func:`stability_chart`: its regions, its curves, and a marker at each special point."""
+    from matplotlib.patches import Patch
+
+    name = chart.metadata["over"]
+    over, speeds = chart[name], chart["belt_speed"]
+    kinds = iter(chart["kind"][(chart["curve"] == "region") & (chart["kind"] != "rest")].tolist())
+    handles: dict[str, Any] = {}
+    for slab in slabs_of(chart):
+        for low, high in zip(slab.bounds, slab.bounds[1:], strict=False):
+            kind = next(kinds)
+            axis.fill_between(slab.values, low, high, color=REGIONS[kind], linewidth=0.0)
+            handles[kind] = Patch(facecolor=REGIONS[kind], edgecolor="0.6", label=kind)
+    for curve, style in BORDERS.items():
+        for branch in np.unique(chart["branch"][(chart["curve"] == curve) & (chart["branch"] >= 0)]):
+            part = (chart["curve"] == curve) & (chart["branch"] == branch)
+            handles[curve] = axis.plot(over[part], speeds[part], linewidth=2.0, **style)[0]  # type: ignore[arg-type]
+    for kind, marker in (("turn", "s"), ("Bautin", "D"), ("grazing fold", "^"), ("meeting", "o")):
+        part = chart["kind"] == kind
+        if part.any():
+            mark: dict[str, Any] = {"linestyle": "none", "color": BLACK, "markersize": 5.5, "label": kind}
+            handles[kind] = axis.plot(over[part], speeds[part], marker=marker, **mark)[0]
+    axis.set_ylim(bottom=0.0)
+    axis.margins(x=0.0, y=0.0)
+    axis.set_xlabel(label_of(name))
+    axis.set_ylabel(label_of("belt_speed"))
+    axis.legend(handles=list(handles.values()), fontsize=8, loc="best")
 
 
 @house_style()

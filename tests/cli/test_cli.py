@@ -24,6 +24,7 @@ from sd_friction_env.cli.main import main
 from sd_friction_env.cli.options import numbers, stop_requests
 from sd_friction_env.control import pretrained
 from sd_friction_env.control.pretrained import pretrained_file
+from sd_friction_env.physics.charts import stability_chart
 from sd_friction_env.physics.curves import refined_curve
 from sd_friction_env.physics.forced import bifurcation_diagram, lyapunov_exponent, poincare_section
 from sd_friction_env.physics.parameters import OscillatorParameters
@@ -136,6 +137,27 @@ def test_a_forced_motion_is_seen_in_its_section_its_exponent_and_its_diagram(tmp
         assert main(["bifurcation", *DRIVE[2:], "--over", *bad, "--folder", str(tmp_path / "none")]) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+def test_a_chart_is_the_functions(tmp_path, capsys):
+    out, plot = tmp_path / "chart.csv", tmp_path / "chart.png"
+    command = ["chart", "--geometry", "linear", "--points", "10", "--over"]
+    kept = ["--folder", str(tmp_path / "kept"), "--out", str(out), "--plot", str(plot)]
+    assert main([*command, "beta", "0.02:0.1", *kept]) == 0
+    wanted = stability_chart(OscillatorParameters(geometry="linear"), ("beta", 0.02, 0.1), points=10)
+    table = Table.from_csv(out)
+    assert np.array_equal(table["belt_speed"], wanted["belt_speed"])
+    assert table["kind"].tolist() == wanted["kind"].tolist()
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    for bad, said in (
+        (["beta", "0.1"], "'0.1' must be LOW:HIGH"),
+        (["beta", "0.1:0.02"], "low < high"),
+        (["mass", "0:1"], "over must be one of"),
+        (["beta", "0.02:0.1", "--against", "alpha"], "against must be one of"),
+        (["beta", "0.02:0.1", "--belt-speed", "0.2"], "an axis of the chart"),
+    ):
+        assert main([*command, *bad]) == 2
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from sd_friction_env.physics.orbits.balance import (
     stick_intervals,
     traps_of,
 )
+from sd_friction_env.physics.orbits.boundaries import GrazingMap, NoBorderError, grazing_map
 from sd_friction_env.physics.orbits.critical import (
     CriticalBeltSpeeds,
     critical_belt_speeds,
@@ -36,7 +37,9 @@ __all__ = [
     "ContactLossError",
     "CriticalBeltSpeeds",
     "Equilibrium",
+    "GrazingMap",
     "LimitCycle",
+    "NoBorderError",
     "OrbitError",
     "ReturnMap",
     "Section",
@@ -47,6 +50,7 @@ __all__ = [
     "equilibria",
     "first_lyapunov_coefficient",
     "grazing_belt_speed",
+    "grazing_map",
     "hopf_belt_speed",
     "limit_cycle",
     "limit_of_motion",

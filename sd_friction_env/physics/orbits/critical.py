@@ -1,7 +1,7 @@
 """Critical belt speeds: where stick-slip ends (grazing), where oscillation ends (Hopf), and how it begins there."""
 
 import math
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -97,7 +97,11 @@ def first_lyapunov_coefficient(parameters: OscillatorParameters) -> float:
     if math.isnan(speed):
         return math.nan
     at_hopf = parameters.replace(belt_speed=speed)
-    plant, x = at_hopf.plant, equilibria(at_hopf)[-1].x
+    return lyapunov_coefficient(at_hopf.plant, speed, equilibria(at_hopf)[-1].x)
+
+
+def lyapunov_coefficient(plant: Any, speed: float, x: float) -> float:
+    """Return the first Lyapunov coefficient of a Hopf point at x."""
     mode, w = kernel.SLIP_BACKWARD, -speed
     friction, spring = plant.friction, plant.spring
     coefficient, slope = friction.coefficient(mode, w), friction.slope(mode, w)

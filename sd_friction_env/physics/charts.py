@@ -1,0 +1,248 @@
+"""Charts of stability over two parameters: where stick-slip ends, where steady slip loses stability, what lies between.
+
+The curves are followed by :mod:`sd_friction_env.physics.continuation`; attractors at a point of each region name it.
+"""
+
+import contextlib
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sd_friction_env.physics.chunks import Columns, Engine, run_chunks
+from sd_friction_env.physics.continuation import Branch, BranchEndError, FloatArray, Point, follow, solution_at
+from sd_friction_env.physics.orbits import OrbitError, attractors
+from sd_friction_env.physics.orbits.balance import check_unexcited
+from sd_friction_env.physics.orbits.boundaries import Border, FoldBorder, GrazingBorder, HopfBorder, NoBorderError
+from sd_friction_env.physics.parameters import (
+    RANGES,
+    STATE_LIMIT,
+    OscillatorParameters,
+    brief_repr,
+    checked_choice,
+    checked_count,
+    checked_number,
+)
+from sd_friction_env.physics.tables import Table
+
+BORDERS: dict[str, type[Border]] = {"v_b0": GrazingBorder, "v_b1": HopfBorder, "fold": FoldBorder}
+_STARTS = 5  # values of the second parameter at which curves are looked for
+_COLUMNS = 301  # values of it at which regions are told apart
+_NAMES = {"stick-slip": "stick-slip", "pure-slip": "pure slip", "steady-slip": "steady slip", "neutral": "neutral"}
+_LEAST_BELT_SPEED = 1e-3
+
+
+class Request(NamedTuple):
+    """One curve of a chart."""
+
+    parameters: OscillatorParameters
+    curve: str
+    name: str
+    low: float
+    high: float
+    points: int
+    starts: tuple[float, ...]
+
+
+def stability_chart(
+    parameters: OscillatorParameters,
+    over: tuple[str, float, float] = ("alpha", 0.1, 1.2),
+    against: str = "belt_speed",
+    *,
+    points: int = 200,
+    engine: Engine | None = None,
+) -> Table:
+    """Return the curves v_b0 and v_b1 over a parameter, their special points, and the regions between them.
+
+    Args:
+        parameters: of the oscillator; the belt speed is not used.
+        over: the second parameter (a number of a user-defined law is ``friction.name`` or ``geometry.name``), and its
+            range.
+        against: "belt_speed".
+        points: least number on a curve from one end of the range to the other, in [10, 100000].
+        engine: where the curves are followed, and the folder that keeps them.
+
+    Returns:
+        A table, one row a point, with the columns curve ("v_b0", "v_b1", "fold": of pure-slip cycles, or "region"),
+        branch, kind, the second parameter, belt_speed, x (of breakaway, of the equilibrium, the greatest of the cycle),
+        period, residual (of all the equations that the point solves), multiplier (of pure-slip cycles at v_b0),
+        first_lyapunov_coefficient, crossings (of the belt's speed in a lap) and reason. Kinds: "start", "point", "end"
+        (reason: why), "turn" (in the second parameter), "Bautin" (first Lyapunov coefficient 0), "grazing fold"
+        (multiplier 1: the fold curve meets v_b0), "meeting" (v_b0 = v_b1), "none" (there is no such curve; reason:
+        why), or of a region its name: "stick-slip", "pure slip", "steady slip", "neutral", "bistable" or "rest".
+
+    Raises:
+        TypeError, ValueError: if an argument is not of the type or in the range above, or the oscillator is excited.
+    """
+    name, low, high = _checked(parameters, over, against)
+    points = checked_count("points", points, 10, 100_000)
+    starts = tuple(sorted({*np.linspace(low, high, _STARTS).tolist(), min(max(parameters.values[name], low), high)}))
+    requests = [Request(parameters, curve, name, low, high, points, starts) for curve in ("v_b0", "v_b1")]
+    metadata = {"parameters": dataclasses.asdict(parameters), "over": name, "against": against}
+    description = {"what": "chart", **metadata, "range": [low, high], "points": points}
+    parts = run_chunks(_curve, requests, engine or Engine(), description=description)
+    near = [
+        value + side * 0.01 * (high - low)
+        for part in parts
+        for value in part[name][np.isin(part["kind"], ("Bautin", "grazing fold"))].tolist()
+        for side in (-1.0, 1.0)
+    ]
+    starts += tuple(value for value in near if low < value < high)
+    folds = _curve(requests[0]._replace(curve="fold", starts=starts))
+    parts.append({column: values[folds["kind"] != "none"] for column, values in folds.items()})
+    curves = Table({column: np.concatenate([part[column] for part in parts]) for column in parts[0]}, metadata)
+    regions = _regions(curves, parameters)
+    return Table(
+        {column: np.append(values, [row[column] for row in regions]) for column, values in curves.items()}
+        if regions
+        else curves,
+        metadata,
+    )
+
+
+def _checked(parameters: Any, over: Any, against: Any) -> tuple[str, float, float]:
+    if not isinstance(parameters, OscillatorParameters):
+        raise TypeError(f"parameters must be OscillatorParameters, got {brief_repr(parameters)}")
+    check_unexcited(parameters)
+    if not isinstance(over, tuple | list) or len(over) != 3 or not isinstance(over[0], str):
+        raise TypeError(f"over must be (name, low, high), got {brief_repr(over)}")
+    checked_choice("against", against, ("belt_speed",))
+    name = checked_choice("over", over[0], tuple(known for known in parameters.values if known != "belt_speed"))
+    low, high = (checked_number(f"over, {name},", value, *RANGES.get(name, (-1e12, 1e12))) for value in over[1:])
+    if not low < high:
+        raise ValueError(f"over must be (name, low, high) with low < high, got {over!r}")
+    return name, low, high
+
+
+# Curves ---------------------------------------------------------------------------------------------------------------
+
+
+def _curve(request: Request) -> Columns:
+    """Return the rows of a curve: all its branches that pass one of the starts."""
+    rows: list[dict[str, Any]] = []
+    followed: list[tuple[Border, list[Point]]] = []
+    for value in request.starts:
+        scale = np.array([1.0, 10.0, 1.0, request.high - request.low])
+        kind = BORDERS[request.curve]
+        scale = scale[[0, 2, 3]] if kind is HopfBorder else scale
+        border: Any = kind(request.parameters, ("belt_speed", request.name), scale)
+        y = np.array([request.parameters.belt_speed, value])
+        try:
+            border.oscillator(y)
+            if not border.directions(y)[1].any():
+                raise NoBorderError(f"the plant does not use the parameter {request.name!r}")
+            y = border.start(y)
+            if any(_passes(other, places, y) for other, places in followed):
+                continue
+            back, forth = (_branch(request, border, y, way) for way in (-1.0, 1.0))
+        except (NoBorderError, BranchEndError, OrbitError) as error:
+            rows.append(_row(request.curve, request.name, "none", (math.nan, value), reason=str(error)))
+            continue
+        places = [*reversed(back.points[1:]), *forth.points]
+        if len(places) > 1:  # a start on an end is not listed twice
+            ends = (places[0].y, places[-1].y)
+            places = [p for p in places if p.kind != "start" or not any(np.allclose(p.y, end) for end in ends)]
+        reasons = {0: back.reason, len(places) - 1: forth.reason}
+        followed.append((border, places))
+        for i, point in enumerate(places):
+            row = _row(request.curve, request.name, point.kind, point.y[-2:], point.residual, reasons.get(i, ""))
+            row |= {"branch": len(followed) - 1, "x": float(point.y[0]), "crossings": getattr(border, "events", 0)}
+            row["period"] = border.period(point.y) if kind is HopfBorder else float(point.y[1])
+            row["multiplier"] = 1.0 if kind is FoldBorder else 1.0 + point.values.get("grazing fold", math.nan)
+            row["first_lyapunov_coefficient"] = point.values.get("Bautin", math.nan)
+            rows.append(row)
+    return {column: np.array([row[column] for row in rows]) for column in rows[0]}
+
+
+def _branch(request: Request, border: Any, start: FloatArray, way: float) -> Branch:
+    tests: dict[str, Any] = {"turn": lambda y, tangent: float(tangent[-1])}
+    if request.curve == "v_b0":
+        tests |= {"grazing fold": lambda y, _: border.multiplier(y) - 1.0, "meeting": lambda y, _: border.damping(y)}
+    elif request.curve == "v_b1":
+        tests["Bautin"] = lambda y, _: border.lyapunov(y) if border.oscillator(y) else math.nan
+    least = 0.0 if request.curve == "v_b1" else _LEAST_BELT_SPEED
+    limits = {-1: (request.low, request.high, request.name), -2: (least, RANGES["belt_speed"][1], "belt_speed")}
+    limits[0] = (-STATE_LIMIT, STATE_LIMIT, "x")
+    along = way * np.eye(len(start))[-1]
+    return follow(border, start, along, longest=1.0 / request.points, limits=limits, tests=tests)
+
+
+def _passes(border: Any, places: list[Point], y: FloatArray) -> bool:
+    """Return whether a curve passes a solution."""
+    for before, after in itertools.pairwise(point.y for point in places):
+        if (before[-1] - y[-1]) * (after[-1] - y[-1]) <= 0.0:
+            with contextlib.suppress(BranchEndError):
+                found = solution_at(border, before, after, len(y) - 1, y[-1])
+                if abs(found[-2] - y[-2]) < 1e-7 * max(1.0, y[-2]):
+                    return True
+    return False
+
+
+def _row(
+    curve: str, name: str, kind: str, place: Iterable[float], residual: float = math.nan, reason: str = ""
+) -> dict[str, Any]:
+    speed, value = map(float, place)
+    row: dict[str, Any] = {"curve": curve, "branch": -1, "kind": kind, name: value, "belt_speed": speed}
+    row |= dict.fromkeys(("x", "period", "residual", "multiplier", "first_lyapunov_coefficient"), math.nan)
+    return row | {"residual": residual, "crossings": 0, "reason": reason}
+
+
+# Regions --------------------------------------------------------------------------------------------------------------
+
+
+class Slab(NamedTuple):
+    """Neighbouring values (n,) of the second parameter, at which the same curves bound regions: ``bounds`` (m, n)."""
+
+    values: FloatArray
+    bounds: FloatArray
+
+
+def slabs_of(chart: Table) -> list[Slab]:
+    """Return a chart cut where a curve begins, ends, turns or crosses another, from belt speed 0 to the top."""
+    over = chart[chart.metadata["over"]]
+    keys = [(str(curve), int(branch)) for curve, branch in zip(chart["curve"], chart["branch"], strict=True)]
+    branches = []
+    for key in dict.fromkeys(key for key in keys if key[1] >= 0):
+        chosen = [i for i, other in enumerate(keys) if other == key]
+        branches.append((key, over[chosen], chart["belt_speed"][chosen]))
+    if not branches:
+        return []
+    top = 1.15 * max(float(speeds.max()) for _, _, speeds in branches)
+    columns = []
+    for value in np.linspace(over.min(), over.max(), _COLUMNS + 2)[1:-1].tolist():
+        met = []
+        for key, p, speeds in branches:
+            for i in np.flatnonzero((p[:-1] <= value) != (p[1:] <= value)).tolist():
+                share = (value - p[i]) / (p[i + 1] - p[i])
+                met.append((float(speeds[i] + share * (speeds[i + 1] - speeds[i])), key))
+        met.sort()
+        columns.append((value, [0.0, *(speed for speed, _ in met), top], [key for _, key in met]))
+    found, half = [], 0.5 * float(np.ptp(over)) / (_COLUMNS + 1)
+    for _, group in itertools.groupby(columns, key=lambda column: column[2]):
+        values, bounds, _ = zip(*group, strict=True)
+        padded = np.pad(np.array(bounds).T, ((0, 0), (1, 1)), "edge")  # up to the next slab
+        found.append(Slab(np.array([values[0] - half, *values, values[-1] + half]), padded))
+    return found
+
+
+def _regions(chart: Table, parameters: OscillatorParameters) -> list[dict[str, Any]]:
+    """Return a row for each region: a point in it and its name."""
+    name, found = chart.metadata["over"], []
+    for slab in slabs_of(chart):
+        middle = len(slab.values) // 2
+        value = float(slab.values[middle])
+        found.append(_row("region", name, "rest", (0.0, value), reason="the belt stands still"))
+        for low, high in itertools.pairwise(slab.bounds[:, middle].tolist()):
+            speed, kind = 0.5 * (low + high), "none"
+            try:
+                cycles = attractors(parameters.replace(**{name: value}, belt_speed=speed))
+                kinds = sorted({cycle.kind for cycle in cycles})
+                reason = " and ".join(kinds) or "no attractor that keeps contact"
+                kind = "bistable" if len(kinds) > 1 else _NAMES.get(reason, "none")
+            except ValueError as error:
+                reason = str(error)
+            found.append(_row("region", name, kind, (speed, value), reason=reason))
+    return found

@@ -7,7 +7,7 @@ sweep that was killed resumes. One process at a time works in a folder.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from sd_friction_env.physics.basins import Basins, basins
 from sd_friction_env.physics.chunks import BACKENDS, Backend, ChunkFunction, Columns, Engine, SweepError, run_chunks
 from sd_friction_env.physics.curves import amplitude_curve, attractor_curves, checked_belt_speeds, cycle_table
-from sd_friction_env.physics.forced import Direction, bifurcation_diagram
+from sd_friction_env.physics.forced import Direction, bifurcation_diagram, response_curve
 from sd_friction_env.physics.parameters import STATE_LIMIT, OscillatorParameters, checked_count, checked_number
 from sd_friction_env.physics.starts import checked_grid
 from sd_friction_env.physics.tables import Table
@@ -31,6 +31,7 @@ __all__ = [
     "amplitude_sweep",
     "basin_sweep",
     "bifurcation_sweep",
+    "response_sweep",
     "run_chunks",
 ]
 
@@ -155,24 +156,56 @@ def bifurcation_sweep(
         TypeError, ValueError: if an argument is not of the type or in the range above, before anything is computed.
         SweepError: see :func:`run_chunks`.
     """
-    cycles, transient = checked_count("cycles", cycles, 1, _MOST), checked_count("transient", transient, 0, _MOST)
+    checked_count("cycles", cycles, 20 if lyapunov else 1, _MOST)
+    arguments = {"direction": direction, "cycles": cycles, "transient": transient, "lyapunov": bool(lyapunov)}
+    return _diagram_sweep("bifurcation", plants, name, values, engine, arguments)
+
+
+def response_sweep(
+    plants: Sequence[OscillatorParameters],
+    name: str,
+    values: ArrayLike,
+    engine: Engine,
+    *,
+    direction: Direction = "both",
+    cycles: int = 32,
+    transient: int = 200,
+) -> list[Table]:
+    """Return the response curve of each plant, as :func:`forced.response_curve` does, bit for bit; one chunk each.
+
+    Arguments and errors are those of :func:`bifurcation_sweep`.
+    """
+    arguments = {"direction": direction, "cycles": cycles, "transient": transient}
+    return _diagram_sweep("response", plants, name, values, engine, arguments)
+
+
+_DIAGRAMS: dict[str, Callable[..., Table]] = {"bifurcation": bifurcation_diagram, "response": response_curve}
+
+
+def _diagram_sweep(
+    what: str,
+    plants: Sequence[OscillatorParameters],
+    name: str,
+    values: ArrayLike,
+    engine: Engine,
+    arguments: dict[str, Any],
+) -> list[Table]:
+    checked_count("transient", arguments["transient"], 0, _MOST)
     numbers = np.unique(np.asarray(values, dtype=np.float64)).tolist()
+    metadata = []
     for plant in plants:
         for value in numbers[1:]:
             plant.replace(**{name: value})
         # Arguments that a diagram would refuse are refused at once by one of the first value.
-        bifurcation_diagram(plant, name, numbers[:1], direction=direction, cycles=20, transient=0, lyapunov=lyapunov)
-    arguments = {"direction": direction, "cycles": cycles, "transient": transient, "lyapunov": bool(lyapunov)}
-    chunks = [(plant, name, numbers, arguments) for plant in plants]
+        first = _DIAGRAMS[what](plant, name, numbers[:1], **(arguments | {"cycles": 20, "transient": 0}))
+        metadata.append(first.metadata)
+    chunks = [(what, plant, name, numbers, arguments) for plant in plants]
     described = [dataclasses.asdict(plant) for plant in plants]
-    description = {"what": "bifurcation", "plants": described, "name": name, "values": numbers, **arguments}
+    description = {"what": what, "plants": described, "name": name, "values": numbers, **arguments}
     results = run_chunks(_diagram_chunk, chunks, engine, description=description)
-    return [
-        Table(columns, {"parameters": dataclasses.asdict(plant), "swept": name})
-        for columns, plant in zip(results, plants, strict=True)
-    ]
+    return [Table(columns, known) for columns, known in zip(results, metadata, strict=True)]
 
 
-def _diagram_chunk(chunk: tuple[OscillatorParameters, str, list[float], dict[str, Any]]) -> Columns:
-    plant, name, values, arguments = chunk
-    return dict(bifurcation_diagram(plant, name, values, **arguments))
+def _diagram_chunk(chunk: tuple[str, OscillatorParameters, str, list[float], dict[str, Any]]) -> Columns:
+    what, plant, name, values, arguments = chunk
+    return dict(_DIAGRAMS[what](plant, name, values, **arguments))

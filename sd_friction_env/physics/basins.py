@@ -57,7 +57,7 @@ class Basins:
         """Return the shares of the attractors, of loss of contact and of starts that are not decided: see
         :func:`fraction_table`."""
         labels = range(UNDECIDED, len(self.attractors))
-        return fraction_table(self.attractors, [np.count_nonzero(self.labels == label) for label in labels])
+        return fraction_table(self.attractors, [int(np.count_nonzero(self.labels == label)) for label in labels])
 
 
 def fraction_table(found: Sequence[LimitCycle], counts: Sequence[int]) -> Table:

@@ -82,7 +82,7 @@ def smallest_shock(
         else:
             misses += 1
     if not found:
-        return Shock(*[math.nan] * 5, reaches=UNDECIDED)
+        return Shock(math.nan, math.nan, math.nan, math.nan, math.nan, UNDECIDED)
     before, after = search.states(best[:, None])
     x, v, dx, dv = (float(part[0]) for part in (*before, *(after - before)))
     return Shock(float(best[0]), x, v, dx, dv, int(search.labels(best[:, None])[0]))

@@ -274,8 +274,8 @@ def integrity_sweep(
         SweepError: see :func:`run_chunks`.
     """
     x, v = checked_grid(x_limits, v_limits, (2, 2))
+    check_search(starts, scales, limit, seed)
     arguments = {"starts": starts, "scales": list(scales), "limit": limit, "seed": seed}
-    check_search(**arguments)
     limits = [x.tolist(), v.tolist()]
     description = {
         "what": "integrity",

@@ -1,4 +1,4 @@
-"""Passive and forced analysis: amplitude, cycle, critical, chart, simulate, basins, poincare, lyapunov, bifurcation."""
+"""Passive and forced analysis: amplitude, cycle, critical, chart, simulate, basins, integrity, poincare, and so on."""
 
 import argparse
 import dataclasses
@@ -33,7 +33,7 @@ from sd_friction_env.cli.options import (
     with_columns,
 )
 from sd_friction_env.physics import sweeps
-from sd_friction_env.physics.basins import LOST_CONTACT, UNDECIDED, basin_grid
+from sd_friction_env.physics.basins import basin_grid
 from sd_friction_env.physics.charts import stability_chart
 from sd_friction_env.physics.curves import checked_belt_speeds, refined_curve
 from sd_friction_env.physics.forced import lyapunov_exponent, poincare_section
@@ -142,22 +142,23 @@ def _simulate(options: argparse.Namespace) -> int:
 def _basins(options: argparse.Namespace) -> int:
     parameters = one_of(options)
     x_limits, v_limits, shape = tuple(options.x), tuple(options.v), tuple(options.shape)
-    if options.backend == "sequential" and options.folder is None:
+    on_disk = options.out is not None and options.out.suffix.lower() == ".npy"
+    if on_disk and options.plot is not None:
+        raise UsageError("--plot needs the labels in memory: leave it out with --out FILE.npy")
+    if on_disk:
+        shares = sweeps.basin_file(parameters, x_limits, v_limits, shape, engine_of(options), options.out)
+    elif options.backend == "sequential" and options.folder is None:
         engine_of(options)  # refuses what does not go with it
         x, v, found = basin_grid(parameters, x_limits, v_limits, shape)  # on all cores
+        shares = found.fractions()
     else:
         x, v, found = sweeps.basin_sweep(parameters, x_limits, v_limits, shape, engine_of(options))
-    names = [f"{cycle.kind} round x = {0.5 * (cycle.x_max + cycle.x_min):.4f}" for cycle in found.attractors]
-    named = dict(enumerate(names)) | {LOST_CONTACT: "contact lost", UNDECIDED: "undecided"}
-    rows: list[dict[str, Any]] = []
-    for label, name in named.items():
-        share, error = found.fraction(label)
-        size = found.attractors[label].amplitude if label >= 0 else math.nan
-        rows.append({"label": label, "attractor": name, "amplitude": size, "fraction": share, "standard_error": error})
-    shares = Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options))
+        shares = found.fractions()
+    shares.metadata = metadata_of(options)
     print_table(options, shares)
-    if options.out is not None:
-        metadata = shares.metadata | {"labels": {str(label): name for label, name in named.items()}}
+    if options.out is not None and not on_disk:
+        named = zip(shares["label"].tolist(), shares["attractor"].tolist(), strict=True)
+        metadata = shares.metadata | {"labels": {str(label): name for label, name in named}}
         if options.out.suffix.lower() == ".npz":
             save_arrays(
                 options.out, {"x": x, "v": v, "labels": found.labels, "metadata": np.array(json.dumps(metadata))}
@@ -170,6 +171,23 @@ def _basins(options: argparse.Namespace) -> int:
         figure, axes = plotting.new_figure(6.8, 4.8, 1, 1)
         plotting.draw_basins(axes[0, 0], x, v, found)
         plotting.save_figure(figure, options.plot)
+    return 0
+
+
+def _integrity(options: argparse.Namespace) -> int:
+    grid = grid_of(options)
+    tables = sweeps.integrity_sweep(
+        [parameters for _, parameters in grid],
+        tuple(options.x),
+        tuple(options.v),
+        engine_of(options),
+        starts=options.starts,
+        scales=tuple(options.scales),
+        limit=options.limit,
+        seed=options.seed,
+    )
+    parts = (with_columns(table, swept) for table, (swept, _) in zip(tables, grid, strict=True))
+    emit(options, stacked(parts, metadata_of(options)))
     return 0
 
 
@@ -200,7 +218,10 @@ def _lyapunov(options: argparse.Namespace) -> int:
     return 0
 
 
-def _bifurcation(options: argparse.Namespace) -> int:
+def _over(
+    options: argparse.Namespace, sweep: Callable[..., list[Table]], draw: Callable[[Any, Table], None], **arguments: Any
+) -> int:
+    """Run a sweep over the parameter of --over for each oscillator of the grid; write it, and draw the first."""
     name, *texts = options.over
     name = name.replace("-", "_")
     try:
@@ -210,24 +231,24 @@ def _bifurcation(options: argparse.Namespace) -> int:
     grid = grid_of(options)
     if name in grid[0][0]:
         raise UsageError(f"--over and --{options.over[0]} are one parameter: give it once")
-    tables = sweeps.bifurcation_sweep(
-        [parameters for _, parameters in grid],
-        name,
-        values,
-        engine_of(options),
-        direction=options.direction,
-        cycles=options.cycles,
-        transient=options.transient,
-        lyapunov=options.exponents,
-    )
+    arguments |= {"direction": options.direction, "cycles": options.cycles, "transient": options.transient}
+    tables = sweep([parameters for _, parameters in grid], name, values, engine_of(options), **arguments)
     parts = (with_columns(part, swept) for part, (swept, _) in zip(tables, grid, strict=True))
     named = ({name if column == "value" else column: data for column, data in part.items()} for part in parts)
     emit(options, stacked(named, metadata_of(options)))
     if options.plot is not None:
         figure, axes = plotting.new_figure(7.0, 4.4, 1, 1)
-        plotting.draw_bifurcation(axes[0, 0], tables[0])
+        draw(axes[0, 0], tables[0])
         plotting.save_figure(figure, options.plot)
     return 0
+
+
+def _bifurcation(options: argparse.Namespace) -> int:
+    return _over(options, sweeps.bifurcation_sweep, plotting.draw_bifurcation, lyapunov=options.exponents)
+
+
+def _response(options: argparse.Namespace) -> int:
+    return _over(options, sweeps.response_sweep, plotting.draw_response)
 
 
 # Options --------------------------------------------------------------------------------------------------------------
@@ -267,14 +288,33 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
     add_output(parser, "displacement, velocity and phase portrait")
 
 
-def _add_basins(parser: argparse.ArgumentParser) -> None:
-    add_engine(parser)
+def _add_box(parser: argparse.ArgumentParser) -> None:
     for name, default in (("--x", (-1.5, 1.5)), ("--v", (-1.0, 1.0))):
         text = f"starts in {name[2:]} (default: {default[0]} {default[1]})"
         parser.add_argument(name, nargs=2, type=float, default=default, metavar=("LOW", "HIGH"), help=text)
+
+
+def _add_basins(parser: argparse.ArgumentParser) -> None:
+    add_engine(parser)
+    _add_box(parser)
     parser.add_argument("--shape", nargs=2, type=int, default=[400, 400], metavar=("N", "M"), help="grid (400 400)")
-    add_output(parser, "the basins", out="the label of each start to FILE.npz, .csv or .json (the shares are printed)")
-    parser.set_defaults(out_endings=(".npz", ".csv", ".json"))
+    add_output(
+        parser,
+        "the basins",
+        out="the label of each start to FILE.npz, .npy (any size), .csv or .json (the shares are printed)",
+    )
+    parser.set_defaults(out_endings=(".npz", ".npy", ".csv", ".json"))
+
+
+def _add_integrity(parser: argparse.ArgumentParser) -> None:
+    add_engine(parser)
+    _add_box(parser)
+    parser.add_argument("--starts", type=int, default=20_000, metavar="N", help="drawn in each round (default: 20000)")
+    text = "lengths of dx and dv that count as 1 in the size of a shock (default: 1 1)"
+    parser.add_argument("--scales", nargs=2, type=float, default=(1.0, 1.0), metavar=("DX", "DV"), help=text)
+    parser.add_argument("--limit", type=float, default=2.0, help="largest size of a shock (default: 2)")
+    parser.add_argument("--seed", type=int, default=0, help="of the draws (default: 0)")
+    add_output(parser, None)
 
 
 def _add_cycles(parser: argparse.ArgumentParser, default: int) -> None:
@@ -296,14 +336,22 @@ def _add_lyapunov(parser: argparse.ArgumentParser) -> None:
     add_output(parser, None)
 
 
-def _add_bifurcation(parser: argparse.ArgumentParser) -> None:
+def _add_over(parser: argparse.ArgumentParser, cycles: int, plot: str) -> None:
     text = "the parameter, and its values or ranges"
     parser.add_argument("--over", nargs="+", required=True, metavar=("NAME", "VALUE"), help=text)
     parser.add_argument("--direction", choices=("up", "down", "both"), default="both", help="(default: both)")
-    _add_cycles(parser, 60)
-    parser.add_argument("--exponents", action="store_true", help="the largest Lyapunov exponent of each as well")
+    _add_cycles(parser, cycles)
     add_engine(parser)
-    add_output(parser, "the diagram")
+    add_output(parser, plot)
+
+
+def _add_bifurcation(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--exponents", action="store_true", help="the largest Lyapunov exponent of each as well")
+    _add_over(parser, 60, "the diagram")
+
+
+def _add_response(parser: argparse.ArgumentParser) -> None:
+    _add_over(parser, 32, "amplitude and phase")
 
 
 def _command(
@@ -354,7 +402,14 @@ COMMANDS = {
         _basins,
         "--alpha 0.2 --plot basins.png",
         "--alpha 0.5 --belt-speed 0.43 --x -1.5 1.5 --v -1 1 --shape 800 800",
+        "--alpha 0.5 --shape 40000 25000 --backend loky --folder kept --out labels.npy",
         "--alpha 0.5 --shape 4000 2500 --backend dask --address tcp://10.0.0.1:8786 --folder basins-alpha-5",
+    ),
+    "integrity": _command(
+        _add_integrity,
+        _integrity,
+        "--alpha 0.5:0.7:0.05 --belt-speed 0.46 --out integrity.csv",
+        "--geometry linear --friction exponential --mu-s 1 --mu-k 0.5 --belt-speed 1.2:1.8:0.1 --scales 1 2",
     ),
     "poincare": _command(_add_poincare, _poincare, f"{_FORCED} --cycles 2000 --out section.csv --plot section.png"),
     "lyapunov": _command(
@@ -368,5 +423,11 @@ COMMANDS = {
         _add_bifurcation,
         _bifurcation,
         "--force-frequency 1.3 --over force-amplitude 0.01:0.3:0.002 --backend loky --plot diagram.png",
+    ),
+    "response": _command(
+        _add_response,
+        _response,
+        "--force-amplitude 0.1 --over force-frequency 0.5:1.5:0.01 --out response.csv --plot response.png",
+        "--geometry duffing --mu-s 0 --mu-m 0 --force-amplitude 0.1 0.2 --over force-frequency 0.8:1.8:0.02",
     ),
 }

@@ -6,8 +6,9 @@ import numpy as np
 import scipy.stats
 from numpy.typing import ArrayLike, NDArray
 
+from sd_friction_env.physics.starts import CONFIDENCE
+
 Array = NDArray[np.float64]
-CONFIDENCE = 0.95
 RESAMPLES = 2000  # of a bootstrap
 Interval = tuple[float, float]
 NO_INTERVAL: Interval = (float("nan"), float("nan"))
@@ -73,12 +74,6 @@ def score_interval(
 def _middle(values: Array) -> Interval:
     low, high = np.quantile(values, (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE)).tolist()
     return low, high
-
-
-def share_interval(hits: int, of: int) -> Interval:
-    """Return the 95% interval of a share by Wilson's score, which (unlike a bootstrap) is not empty at 0 and 1."""
-    found = scipy.stats.binomtest(hits, of).proportion_ci(CONFIDENCE, method="wilson")
-    return float(found.low), float(found.high)
 
 
 def interquartile_mean(values: ArrayLike) -> float:

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,8 @@ from sd_friction_env.physics.orbits import (
     traps_of,
 )
 from sd_friction_env.physics.parameters import STATE_LIMIT, OscillatorParameters, checked_number
-from sd_friction_env.physics.starts import checked_grid, in_threads
+from sd_friction_env.physics.starts import checked_grid, in_threads, share_interval
+from sd_friction_env.physics.tables import Table
 
 LOST_CONTACT, UNDECIDED = -1, -2
 
@@ -50,6 +52,39 @@ class Basins:
         """Return the share p of starts with a label, and its standard error for uniform draws, sqrt(p (1 - p)/n)."""
         share = float((self.labels == label).mean())
         return share, math.sqrt(share * (1.0 - share) / self.labels.size)
+
+    def fractions(self) -> Table:
+        """Return the shares of the attractors, of loss of contact and of starts that are not decided: see
+        :func:`fraction_table`."""
+        labels = range(UNDECIDED, len(self.attractors))
+        return fraction_table(self.attractors, [int(np.count_nonzero(self.labels == label)) for label in labels])
+
+
+def fraction_table(found: Sequence[LimitCycle], counts: Sequence[int]) -> Table:
+    """Return shares of starts as a table.
+
+    Args:
+        found: attractors.
+        counts: numbers of starts with the labels -2, -1 (see :class:`Basins`), 0, 1, ...
+
+    Returns:
+        A table with a row for each attractor and for the labels -1 and -2: label, attractor (its kind and middle),
+        amplitude, fraction, its standard_error for uniform draws, and its 95% interval fraction_low, fraction_high
+        (Wilson).
+    """
+    rows = []
+    total = sum(map(int, counts))
+    for label in (*range(len(found)), LOST_CONTACT, UNDECIDED):
+        cycle = found[label] if label >= 0 else None
+        name = {LOST_CONTACT: "contact lost", UNDECIDED: "undecided"}.get(label, "")
+        if cycle is not None:
+            name = f"{cycle.kind} round x = {0.5 * (cycle.x_max + cycle.x_min):.4f}"
+        share = int(counts[label - UNDECIDED]) / total
+        low, high = share_interval(int(counts[label - UNDECIDED]), total)
+        row = {"label": label, "attractor": name, "amplitude": cycle.amplitude if cycle else math.nan}
+        row |= {"fraction": share, "standard_error": math.sqrt(share * (1.0 - share) / total)}
+        rows.append(row | {"fraction_low": low, "fraction_high": high})
+    return Table({name: [row[name] for row in rows] for name in rows[0]})
 
 
 def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, threads: int | None = None) -> Basins:

@@ -110,32 +110,50 @@ def run_chunks(
             repeatedly.
         OSError: if the folder cannot be written to.
     """
+    return list(stream_chunks(function, chunks, engine, description=description))
+
+
+def stream_chunks(
+    function: ChunkFunction, chunks: Sequence[Any], engine: Engine, *, description: Mapping[str, Any]
+) -> Iterator[Columns]:
+    """Yield what :func:`run_chunks` returns: with a folder, or in this process, few results are in memory at a time.
+
+    Arguments and errors are those of :func:`run_chunks`; nothing is checked before the first result is asked for.
+    """
     with _Store(engine.folder, len(chunks), description) as store:
-        return _run_chunks(function, chunks, engine, store)
+        yield from _stream_chunks(function, chunks, engine, store)
 
 
-def _run_chunks(function: ChunkFunction, chunks: Sequence[Any], engine: Engine, store: "_Store") -> list[Columns]:
-    results: dict[int, Columns] = dict(store.finished())
+def _stream_chunks(
+    function: ChunkFunction, chunks: Sequence[Any], engine: Engine, store: "_Store"
+) -> Iterator[Columns]:
+    finished = store.finished()
+    waiting: dict[int, Columns] = {}  # computed, not stored, and not yielded because an earlier one is missing
+    yielded = lost = 0
     show = engine.progress or (lambda done, total: None)
-    if results:
-        show(len(results), len(chunks))
-    lost = 0
+    if finished:
+        show(len(finished), len(chunks))
     with _workers(engine) as parallel:
-        while len(results) < len(chunks):
-            missing = [index for index in range(len(chunks)) if index not in results]
-            before = len(results)
+        while len(finished) < len(chunks):
+            missing = [index for index in range(len(chunks)) if index not in finished]
+            before = len(finished)
             try:
                 for index, columns in parallel(function, [(index, chunks[index]) for index in missing]):
-                    store.keep(index, columns)
-                    results[index] = columns
-                    show(len(results), len(chunks))
+                    if not store.keep(index, columns):
+                        waiting[index] = columns
+                    finished.add(index)
+                    show(len(finished), len(chunks))
+                    while yielded in finished:
+                        yield waiting.pop(yielded) if yielded in waiting else store.read(yielded)
+                        yielded += 1
             except _worker_losses(engine.backend) as error:
-                lost = 0 if len(results) > before else lost + 1
+                lost = 0 if len(finished) > before else lost + 1
                 if lost >= _PATIENCE:
                     raise SweepError(
                         f"workers were lost {lost} times with no chunk finished between; the last time: {error}"
                     ) from error
-    return [results[index] for index in range(len(chunks))]
+    for index in range(yielded, len(chunks)):
+        yield store.read(index)
 
 
 def _numbered(function: ChunkFunction, index: int, chunk: Any) -> tuple[int, Columns]:
@@ -280,6 +298,7 @@ class _Store:
         self.count = count
         self.wanted = {"sd_friction_env": importlib.metadata.version("sd-friction-env"), "chunks": count, **description}
         self.digest = content_digest(self.wanted)
+        self.paths: dict[int, Path] = {}
         self.stack = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
@@ -331,31 +350,51 @@ class _Store:
                 raise SweepError(f"folder {name!r} holds another sweep: its {key} is {was}, not {now}")
         return True
 
-    def finished(self) -> Iterator[tuple[int, Columns]]:
-        """Yield the stored chunks that are whole and of this sweep; remove the others, to be computed again."""
+    def finished(self) -> set[int]:
+        """Return which stored chunks are whole and of this sweep; remove the others, to be computed again."""
         for path in sorted(self.folder.glob("chunk-*.npz")) if self.folder else []:
-            named = re.fullmatch(r"chunk-(\d{1,9})-([0-9a-f]{64})\.npz", path.name)
-            columns: Columns | None = None
-            with contextlib.suppress(StoredFileError), naming(path):
-                data = read_bytes(path)
-                if named is not None and hashlib.sha256(data).hexdigest() == named[2]:
-                    columns = read_arrays(io.BytesIO(data), _COLUMN_KINDS, texts=(_BELONGS,))
-            if named and columns and str(columns.pop(_BELONGS, "")) == self._place(int(named[1])):
-                yield int(named[1]), columns
-            elif path.is_dir():
+            named = re.fullmatch(r"chunk-(\d{1,9})-[0-9a-f]{64}\.npz", path.name)
+            if path.is_dir():
                 raise SweepError(f"{str(path)!r} must be a file; it is a folder")
+            if named and self._content(path, int(named[1])) is not None:
+                self.paths[int(named[1])] = path
             else:
                 path.unlink()
+        return set(self.paths)
 
-    def keep(self, index: int, columns: Columns) -> None:
-        """Write a chunk, whole or not at all."""
+    def read(self, index: int) -> Columns:
+        """Return a stored chunk.
+
+        Raises:
+            SweepError: if its file has been changed or removed since it was found whole.
+        """
+        columns = self._content(self.paths[index], index)
+        if columns is None:
+            raise SweepError(f"{str(self.paths[index])!r} was changed during the sweep: start the same sweep again")
+        return columns
+
+    def _content(self, path: Path, index: int) -> Columns | None:
+        """Return the columns in a chunk's file, None if it is damaged or of another sweep or place."""
+        with contextlib.suppress(StoredFileError, FileNotFoundError), naming(path):
+            data = read_bytes(path)
+            if hashlib.sha256(data).hexdigest() == path.stem.rpartition("-")[2]:
+                columns = read_arrays(io.BytesIO(data), _COLUMN_KINDS, texts=(_BELONGS,))
+                if str(columns.pop(_BELONGS, "")) == self._place(index):
+                    return columns
+        return None
+
+    def keep(self, index: int, columns: Columns) -> bool:
+        """Write a chunk, whole or not at all; return whether there is a folder to write it to."""
         if self.folder is None:
-            return
+            return False
         buffer = io.BytesIO()
         write_arrays(buffer, {**columns, _BELONGS: np.array(self._place(index))}, compress=True)
         data = buffer.getvalue()
-        with atomic_file(self.folder / f"chunk-{index:06d}-{hashlib.sha256(data).hexdigest()}.npz", "wb") as file:
+        path = self.folder / f"chunk-{index:06d}-{hashlib.sha256(data).hexdigest()}.npz"
+        with atomic_file(path, "wb") as file:
             file.write(data)
+        self.paths[index] = path
+        return True
 
     def _place(self, index: int) -> str:
         return f"{self.digest} {index} of {self.count}"

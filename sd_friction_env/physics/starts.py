@@ -1,4 +1,4 @@
-"""Starts by the million: grids of them, and threads that share them."""
+"""Starts by the million: grids of them, threads that share them, and the interval of a share."""
 
 import itertools
 import os
@@ -6,10 +6,12 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import scipy.stats
 from numpy.typing import NDArray
 
 from sd_friction_env.physics.parameters import STATE_LIMIT, checked_count, checked_number
 
+CONFIDENCE = 0.95
 _MOST_STARTS = 10_000_000  # of one axis
 
 
@@ -45,3 +47,9 @@ def in_threads(work: Callable[[slice], None], count: int, per_thread: int, threa
     edges = np.linspace(0, count, 8 * threads + 1).astype(int).tolist()
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, itertools.starmap(slice, itertools.pairwise(edges))))
+
+
+def share_interval(hits: int, of: int) -> tuple[float, float]:
+    """Return the 95% interval of a share by Wilson's score, which (unlike a bootstrap) is not empty at 0 and 1."""
+    found = scipy.stats.binomtest(hits, of).proportion_ci(CONFIDENCE, method="wilson")
+    return float(found.low), float(found.high)

@@ -7,19 +7,31 @@ sweep that was killed resumes. One process at a time works in a folder.
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+import os
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env.physics.basins import Basins, basins
-from sd_friction_env.physics.chunks import BACKENDS, Backend, ChunkFunction, Columns, Engine, SweepError, run_chunks
+from sd_friction_env.physics.basins import UNDECIDED, Basins, basins, fraction_table
+from sd_friction_env.physics.chunks import (
+    BACKENDS,
+    Backend,
+    ChunkFunction,
+    Columns,
+    Engine,
+    SweepError,
+    run_chunks,
+    stream_chunks,
+)
 from sd_friction_env.physics.curves import amplitude_curve, attractor_curves, checked_belt_speeds, cycle_table
-from sd_friction_env.physics.forced import Direction, bifurcation_diagram
+from sd_friction_env.physics.forced import Direction, bifurcation_diagram, response_curve
 from sd_friction_env.physics.parameters import STATE_LIMIT, OscillatorParameters, checked_count, checked_number
+from sd_friction_env.physics.shocks import basin_integrity, check_search, without_attractors
 from sd_friction_env.physics.starts import checked_grid
 from sd_friction_env.physics.tables import Table
+from sd_friction_env.storage import atomic_file, checked_ending
 
 __all__ = [
     "BACKENDS",
@@ -29,9 +41,13 @@ __all__ = [
     "Engine",
     "SweepError",
     "amplitude_sweep",
+    "basin_file",
     "basin_sweep",
     "bifurcation_sweep",
+    "integrity_sweep",
+    "response_sweep",
     "run_chunks",
+    "stream_chunks",
 ]
 
 STARTS_A_CHUNK, SPEEDS_A_CHUNK = 250_000, 25
@@ -109,21 +125,76 @@ def basin_sweep(
         TypeError, ValueError: if an argument is not of the type or in the range above, before anything is computed.
         SweepError: see :func:`run_chunks`.
     """
-    x, v = checked_grid(x_limits, v_limits, shape)
-    rows = max(1, checked_count("chunk", chunk, 1, _MOST) // len(x))
-    description = {
-        "what": "basins",
-        "parameters": dataclasses.asdict(parameters),
-        "x_limits": [float(x[0]), float(x[-1])],
-        "v_limits": [float(v[0]), float(v[-1])],
-        "shape": [len(x), len(v)],
-        "rows_a_chunk": rows,
-    }
-    found = basins(parameters, x[:1], v[:1])  # the attractors, and what may be wrong with the parameters
-    chunks = [(parameters, x, v[i : i + rows]) for i in range(0, len(v), rows)]
-    results = run_chunks(_basin_chunk, chunks, engine, description=description)
-    labels = np.concatenate([part["labels"] for part in results])
-    return x, v, dataclasses.replace(found, labels=labels)
+    grid = _BasinChunks.of(parameters, x_limits, v_limits, shape, chunk)
+    results = run_chunks(_basin_chunk, grid.chunks, engine, description=grid.description)
+    return grid.x, grid.v, dataclasses.replace(grid.found, labels=np.concatenate([part["labels"] for part in results]))
+
+
+def basin_file(
+    parameters: OscillatorParameters,
+    x_limits: tuple[float, float],
+    v_limits: tuple[float, float],
+    shape: tuple[int, int],
+    engine: Engine,
+    path: str | os.PathLike[str],
+    *,
+    chunk: int = STARTS_A_CHUNK,
+) -> Table:
+    """Write the labels of a grid of any size to an .npy file and return :func:`basins.fraction_table`.
+
+    The file is written whole or not at all; ``numpy.load(path, mmap_mode="r")`` opens it as int8 of shape (m, n), rows
+    of one v each. Memory holds a few chunks at a time, with loky as with one process, whatever the number of starts.
+
+    Args:
+        parameters, x_limits, v_limits, shape, engine, chunk: as of :func:`basin_sweep`.
+        path: of the file.
+
+    Raises:
+        OSError: if the file cannot be written.
+        TypeError, ValueError, SweepError: as :func:`basin_sweep`, and if the name does not end in .npy.
+    """
+    checked_ending(path, (".npy",))
+    grid = _BasinChunks.of(parameters, x_limits, v_limits, shape, chunk)
+    counts = np.zeros(len(grid.found.attractors) - UNDECIDED, dtype=np.int64)
+    with atomic_file(path, "wb") as file:
+        shown = {"descr": "|i1", "fortran_order": False, "shape": (len(grid.v), len(grid.x))}
+        np.lib.format.write_array_header_1_0(file, shown)
+        for part in stream_chunks(_basin_chunk, grid.chunks, engine, description=grid.description):
+            counts += np.bincount(part["labels"].ravel().astype(np.intp) - UNDECIDED, minlength=len(counts))
+            file.write(part["labels"].tobytes())
+    return fraction_table(grid.found.attractors, counts.tolist())
+
+
+class _BasinChunks(NamedTuple):
+    """A grid of starts as chunks of whole rows, with the attractors that they reach."""
+
+    x: NDArray[np.float64]
+    v: NDArray[np.float64]
+    found: Basins
+    chunks: list[Any]
+    description: dict[str, Any]
+
+    @classmethod
+    def of(
+        cls,
+        parameters: OscillatorParameters,
+        x_limits: tuple[float, float],
+        v_limits: tuple[float, float],
+        shape: tuple[int, int],
+        chunk: int,
+    ) -> Self:
+        x, v = checked_grid(x_limits, v_limits, shape)
+        rows = max(1, checked_count("chunk", chunk, 1, _MOST) // len(x))
+        description = {
+            "what": "basins",
+            "parameters": dataclasses.asdict(parameters),
+            "x_limits": [float(x[0]), float(x[-1])],
+            "v_limits": [float(v[0]), float(v[-1])],
+            "shape": [len(x), len(v)],
+            "rows_a_chunk": rows,
+        }
+        found = basins(parameters, x[:1], v[:1])  # the attractors, and what may be wrong with the parameters
+        return cls(x, v, found, [(parameters, x, v[i : i + rows]) for i in range(0, len(v), rows)], description)
 
 
 def _basin_chunk(chunk: tuple[OscillatorParameters, NDArray[np.float64], NDArray[np.float64]]) -> Columns:
@@ -155,24 +226,103 @@ def bifurcation_sweep(
         TypeError, ValueError: if an argument is not of the type or in the range above, before anything is computed.
         SweepError: see :func:`run_chunks`.
     """
-    cycles, transient = checked_count("cycles", cycles, 1, _MOST), checked_count("transient", transient, 0, _MOST)
+    checked_count("cycles", cycles, 20 if lyapunov else 1, _MOST)
+    arguments = {"direction": direction, "cycles": cycles, "transient": transient, "lyapunov": bool(lyapunov)}
+    return _diagram_sweep("bifurcation", plants, name, values, engine, arguments)
+
+
+def response_sweep(
+    plants: Sequence[OscillatorParameters],
+    name: str,
+    values: ArrayLike,
+    engine: Engine,
+    *,
+    direction: Direction = "both",
+    cycles: int = 32,
+    transient: int = 200,
+) -> list[Table]:
+    """Return the response curve of each plant, as :func:`forced.response_curve` does, bit for bit; one chunk each.
+
+    Arguments and errors are those of :func:`bifurcation_sweep`.
+    """
+    arguments = {"direction": direction, "cycles": cycles, "transient": transient}
+    return _diagram_sweep("response", plants, name, values, engine, arguments)
+
+
+def integrity_sweep(
+    plants: Sequence[OscillatorParameters],
+    x_limits: tuple[float, float],
+    v_limits: tuple[float, float],
+    engine: Engine,
+    *,
+    starts: int = 20_000,
+    scales: tuple[float, float] = (1.0, 1.0),
+    limit: float = 2.0,
+    seed: int = 0,
+) -> list[Table]:
+    """Return the table of each plant that :func:`shocks.basin_integrity` returns, bit for bit; one chunk each.
+
+    A plant without basins (excited, or with a belt at rest) has one row of NaN with the reason.
+
+    Args:
+        plants: (n,) oscillators.
+        engine: where it runs.
+        x_limits, v_limits, starts, scales, limit, seed: as of ``basin_integrity``.
+
+    Raises:
+        TypeError, ValueError: if an argument is not of the type or in the range above, before anything is computed.
+        SweepError: see :func:`run_chunks`.
+    """
+    x, v = checked_grid(x_limits, v_limits, (2, 2))
+    check_search(starts, scales, limit, seed)
+    arguments = {"starts": starts, "scales": list(scales), "limit": limit, "seed": seed}
+    limits = [x.tolist(), v.tolist()]
+    description = {
+        "what": "integrity",
+        "plants": [dataclasses.asdict(p) for p in plants],
+        "limits": limits,
+        **arguments,
+    }
+    chunks = [(plant, limits, arguments) for plant in plants]
+    results = run_chunks(_integrity_chunk, chunks, engine, description=description)
+    return [Table(columns) for columns in results]
+
+
+def _integrity_chunk(chunk: tuple[OscillatorParameters, list[Any], dict[str, Any]]) -> Columns:
+    plant, limits, arguments = chunk
+    try:
+        return dict(basin_integrity(plant, *limits, **arguments))
+    except ValueError as error:
+        return dict(without_attractors(str(error)))
+
+
+_DIAGRAMS: dict[str, Callable[..., Table]] = {"bifurcation": bifurcation_diagram, "response": response_curve}
+
+
+def _diagram_sweep(
+    what: str,
+    plants: Sequence[OscillatorParameters],
+    name: str,
+    values: ArrayLike,
+    engine: Engine,
+    arguments: dict[str, Any],
+) -> list[Table]:
+    checked_count("transient", arguments["transient"], 0, _MOST)
     numbers = np.unique(np.asarray(values, dtype=np.float64)).tolist()
+    metadata = []
     for plant in plants:
         for value in numbers[1:]:
             plant.replace(**{name: value})
         # Arguments that a diagram would refuse are refused at once by one of the first value.
-        bifurcation_diagram(plant, name, numbers[:1], direction=direction, cycles=20, transient=0, lyapunov=lyapunov)
-    arguments = {"direction": direction, "cycles": cycles, "transient": transient, "lyapunov": bool(lyapunov)}
-    chunks = [(plant, name, numbers, arguments) for plant in plants]
+        first = _DIAGRAMS[what](plant, name, numbers[:1], **(arguments | {"cycles": 20, "transient": 0}))
+        metadata.append(first.metadata)
+    chunks = [(what, plant, name, numbers, arguments) for plant in plants]
     described = [dataclasses.asdict(plant) for plant in plants]
-    description = {"what": "bifurcation", "plants": described, "name": name, "values": numbers, **arguments}
+    description = {"what": what, "plants": described, "name": name, "values": numbers, **arguments}
     results = run_chunks(_diagram_chunk, chunks, engine, description=description)
-    return [
-        Table(columns, {"parameters": dataclasses.asdict(plant), "swept": name})
-        for columns, plant in zip(results, plants, strict=True)
-    ]
+    return [Table(columns, known) for columns, known in zip(results, metadata, strict=True)]
 
 
-def _diagram_chunk(chunk: tuple[OscillatorParameters, str, list[float], dict[str, Any]]) -> Columns:
-    plant, name, values, arguments = chunk
-    return dict(bifurcation_diagram(plant, name, values, **arguments))
+def _diagram_chunk(chunk: tuple[str, OscillatorParameters, str, list[float], dict[str, Any]]) -> Columns:
+    what, plant, name, values, arguments = chunk
+    return dict(_DIAGRAMS[what](plant, name, values, **arguments))

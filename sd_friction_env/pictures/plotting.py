@@ -386,6 +386,21 @@ def draw_chart(axis: "Axes", chart: Table) -> None:
 
 
 @house_style()
+def draw_response(axis: "Axes", curve: Table) -> None:
+    """Draw :func:`forced.response_curve`: the amplitude, and in a second scale the phase of the first harmonic."""
+    angles = axis.twinx()
+    for way, size in zip(WAYS, (5.0, 2.5), strict=True):
+        part = curve["direction"] == way
+        if part.any():
+            _draw_dots(axis, curve["value"][part], curve["amplitude"][part], size, WAYS[way], way)
+            angles.plot(curve["value"][part], curve["phase"][part], color=WAYS[way], linewidth=1.0, linestyle=":")
+    axis.set_xlabel(label_of(curve.metadata["swept"]))
+    axis.set_ylabel("amplitude")
+    angles.set_ylabel("phase (dotted), rad")
+    axis.legend(fontsize=8, frameon=False, loc="best")
+
+
+@house_style()
 def draw_exponents(axis: "Axes", table: Table, floor: float = -0.25) -> None:
     """Draw the largest exponent over the value of a sweep, with two standard errors; below ``floor`` it is cut off."""
     for way, width, line in (("up", 2.4, "-"), ("down", 1.0, (0, (4, 1.2)))):

@@ -360,6 +360,36 @@ def test_basins_writes_the_label_of_each_start(tmp_path, capsys):
     assert table["v"][::6].tolist() == v.tolist()
 
 
+def test_basins_of_any_size_go_to_disk_and_are_not_drawn(tmp_path, capsys):
+    arguments = ["basins", "--alpha", "0.2", "--shape", "6", "5", "--out", str(tmp_path / "grid.npy")]
+    assert main([*arguments, "--plot", str(tmp_path / "grid.png")]) == 2
+    assert "leave it out with --out FILE.npy" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert main(arguments) == 0
+    assert "fraction_low" in capsys.readouterr().out
+    _, _, found = basin_grid(OscillatorParameters(alpha=0.2), shape=(6, 5))
+    assert np.array_equal(np.load(tmp_path / "grid.npy"), found.labels)
+
+
+def test_integrity_and_response_write_tables(tmp_path, capsys):
+    out = tmp_path / "out.csv"
+    assert (
+        main(["integrity", "--alpha", "0.5", "0.8", "--belt-speed", "0.46", "--starts", "1000", "--out", str(out)]) == 0
+    )
+    table = Table.from_csv(out)
+    assert table["alpha"].tolist() == [0.5, 0.5, 0.8]
+    assert table["note"].tolist() == ["", "", "the only attractor"]
+    linear = ["--geometry", "linear", "--mu-s", "0", "--mu-m", "0", "--force-amplitude", "0.1"]
+    plot = tmp_path / "out.png"
+    command = ["response", *linear, "--over", "force-frequency", "0.9:1.1:0.1", "--out", str(out), "--plot", str(plot)]
+    assert main(command) == 0
+    table = Table.from_csv(out)
+    assert table["force_frequency"].tolist() == [0.9, 1.0, 1.1, 1.1, 1.0, 0.9]
+    assert table["amplitude"][1] == pytest.approx(1.0, rel=1e-6)
+    assert plot.stat().st_size > 1000
+    assert capsys.readouterr().err == ""
+
+
 def test_a_refined_curve_has_the_critical_speeds_from_both_sides():
     plain = amplitude_curve(OscillatorParameters(), [0.2, 0.6])
     curve = refined_curve(OscillatorParameters(), [0.2, 0.6])

@@ -16,6 +16,7 @@ from sd_friction_env.control.policies import ConstantPolicy, NetworkPolicy, Velo
 from sd_friction_env.learning import classical, evaluation, optimal, scores
 from sd_friction_env.learning.evaluation import Episodes, evaluate, metrics, run_episodes, summarise
 from sd_friction_env.learning.scores import score
+from sd_friction_env.physics.starts import share_interval
 from sd_friction_env.storage import AGENTS
 
 STEPS = 40
@@ -216,8 +217,8 @@ def test_the_interval_of_a_share_is_wilsons():
     z = scipy.stats.norm.ppf(0.975)
     hits, n = 7, 20
     centre, half = (hits + z * z / 2) / (n + z * z), z / (n + z * z) * np.sqrt(hits * (n - hits) / n + z * z / 4)
-    assert scores.share_interval(hits, n) == pytest.approx((centre - half, centre + half))
-    assert scores.share_interval(100, 100)[0] == pytest.approx(100 / (100 + z * z))
+    assert share_interval(hits, n) == pytest.approx((centre - half, centre + half))
+    assert share_interval(100, 100)[0] == pytest.approx(100 / (100 + z * z))
 
 
 def test_each_episode_may_have_parameters_of_its_own():

@@ -8,7 +8,7 @@ exist: such events are counted in ``singular_events``, and passed over.
 """
 
 from sd_friction_env.physics.forced.basins import LOST_CONTACT, UNDECIDED, ForcedBasins, forced_basins
-from sd_friction_env.physics.forced.diagrams import Direction, bifurcation_diagram
+from sd_friction_env.physics.forced.diagrams import Direction, bifurcation_diagram, response_curve
 from sd_friction_env.physics.forced.exponents import LyapunovExponent, lyapunov_exponent
 from sd_friction_env.physics.forced.orbits import ForcedOrbit, forced_orbit
 from sd_friction_env.physics.forced.sections import dithered_amplitude, drive_period, poincare_section
@@ -27,4 +27,5 @@ __all__ = [
     "forced_orbit",
     "lyapunov_exponent",
     "poincare_section",
+    "response_curve",
 ]

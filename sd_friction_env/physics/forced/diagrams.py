@@ -1,9 +1,9 @@
-"""Bifurcation diagrams: section points over a parameter, each value continued from the one before."""
+"""Diagrams over a parameter, each value continued from the one before: section points, response of a forced motion."""
 
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,10 +20,14 @@ from sd_friction_env.physics.forced.sections import (
 )
 from sd_friction_env.physics.orbits import OrbitError, traps_of
 from sd_friction_env.physics.parameters import RANGES, OscillatorParameters, checked_choice, checked_count
+from sd_friction_env.physics.simulation import amplitude, simulate
 from sd_friction_env.physics.tables import Table
 from sd_friction_env.physics.theory import FloatArray
 
 Direction = Literal["up", "down", "both"]
+State: TypeAlias = tuple[float, float]
+
+_SAMPLES_A_CYCLE = 512
 
 
 def bifurcation_diagram(
@@ -66,10 +70,81 @@ def bifurcation_diagram(
         TypeError, ValueError: if an argument is not of the type or in the range above.
     """
     checked_choice("name", name, tuple(RANGES))
-    checked_choice("direction", direction, get_args(Direction))
     cycles = checked_count("cycles", cycles, BATCHES if lyapunov else 1, MOST_CYCLES)
     transient = checked_count("transient", transient, 0, MOST_CYCLES)
-    Stroboscope(parameters, 0.0).checked_start(x, v)
+    points = _points(parameters, name, values, period)
+
+    def measured(strobe: Stroboscope, state: State) -> tuple[dict[str, Any], State | None]:
+        return _section_at(strobe, state, transient, cycles, lyapunov)
+
+    columns = _continued(points, direction, measured, (x, v), progress)
+    section = "stroboscopic" if points[0][1].period > 0.0 else "maxima of x"
+    return Table(columns, {"parameters": dataclasses.asdict(parameters), "swept": name, "section": section})
+
+
+def response_curve(
+    parameters: OscillatorParameters,
+    name: str,
+    values: ArrayLike,
+    *,
+    direction: Direction = "both",
+    cycles: int = 32,
+    transient: int = 200,
+    x: float = 0.0,
+    v: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Table:
+    """Return the response of a forced motion over a parameter, each value starting from the last state of the one
+    before: where the ways up and down differ there is hysteresis.
+
+    Args:
+        parameters: of the oscillator, with one of the excitations acting.
+        name: of a number among the parameters, such as "force_frequency".
+        values, direction, transient, x, v, progress: as of :func:`bifurcation_diagram`.
+        cycles: of the excitation, over which each response is measured, from 1 on.
+
+    Returns:
+        A table with the columns value, direction, amplitude (half the distance between the extremes of x),
+        first_harmonic (amplitude of x at the excitation's frequency), phase (of that harmonic after the excitation, in
+        radians in (-pi, pi]; below 0 it lags), stick_fraction and note (why a row is NaN, else empty).
+
+    Raises:
+        TypeError, ValueError: if an argument is not of the type or in the range above, or not one excitation acts.
+    """
+    checked_choice("name", name, tuple(RANGES))
+    acting = active_excitations(parameters, swept=name)
+    if len(acting) != 1:
+        raise ValueError(f"parameters must have one excitation that acts, got {acting or 'none'}: {parameters!r}")
+    cycles = checked_count("cycles", cycles, 1, MOST_CYCLES // _SAMPLES_A_CYCLE)
+    transient = checked_count("transient", transient, 0, MOST_CYCLES)
+    phase_name = f"{acting[0]}_phase"
+
+    def measured(strobe: Stroboscope, state: State) -> tuple[dict[str, Any], State | None]:
+        try:
+            begin = strobe.follow(state, transient - 1, 1).end if transient else state
+            recorded = strobe.follow(begin, 0, cycles)
+        except OrbitError as error:
+            row = dict.fromkeys(("amplitude", "first_harmonic", "phase", "stick_fraction"), math.nan)
+            return {key: [cell] for key, cell in (row | {"note": str(error)}).items()}, None
+        dt = strobe.period / _SAMPLES_A_CYCLE
+        samples = simulate(strobe.parameters, *begin, cycles * strobe.period, dt=dt).x[:-1]
+        # Sums over whole cycles: the trapezium rule, which a periodic integrand makes exact to high order.
+        turns = np.exp(-2j * math.pi / _SAMPLES_A_CYCLE * np.arange(len(samples)))
+        harmonic = 2.0 * np.mean(samples * turns) * np.exp(-1j * getattr(strobe.parameters, phase_name))
+        extremes = recorded.rows[:, kernel.CYCLE_X_MIN].min(), recorded.rows[:, kernel.CYCLE_X_MAX].max()
+        row = {"amplitude": amplitude(*map(float, extremes)), "first_harmonic": abs(harmonic)}
+        row["phase"] = float(np.angle(harmonic))
+        row["stick_fraction"] = recorded.rows[:, kernel.CYCLE_STICK_TIME].mean() / strobe.period
+        return {key: [cell] for key, cell in (row | {"note": ""}).items()}, recorded.end
+
+    columns = _continued(_points(parameters, name, values, None), direction, measured, (x, v), progress)
+    return Table(columns, {"parameters": dataclasses.asdict(parameters), "swept": name, "excitation": acting[0]})
+
+
+def _points(
+    parameters: OscillatorParameters, name: str, values: ArrayLike, period: float | None
+) -> list[tuple[float, Stroboscope]]:
+    """Return the checked values, ascending, each with its stroboscope (of period 0 without excitation)."""
     try:
         numbers = np.unique(np.asarray(values, dtype=np.float64))
     except (TypeError, ValueError):
@@ -84,26 +159,35 @@ def bifurcation_diagram(
         periods = [common_period(plant, acting) for plant in plants]
     else:
         periods = [checked_period(plant, period, repeats=False) for plant in plants]
-    points = [(value, *pair) for value, pair in zip(numbers.tolist(), zip(plants, periods, strict=True), strict=True)]
+    return list(zip(numbers.tolist(), map(Stroboscope, plants, periods), strict=True))
+
+
+def _continued(
+    points: list[tuple[float, Stroboscope]],
+    direction: Direction,
+    measured: Callable[[Stroboscope, State], tuple[dict[str, Any], State | None]],
+    start: tuple[float, float | None],
+    progress: Callable[[int, int], None] | None,
+) -> dict[str, Any]:
+    """Return the columns that ``measured`` gives at each value, from the state in which it left the one before."""
+    checked_choice("direction", direction, get_args(Direction))
+    points[0][1].checked_start(*start)
     ways = {"up": ["up"], "down": ["down"], "both": ["up", "down"]}[direction]
     parts: list[dict[str, Any]] = []
-    state: tuple[float, float] | None = None
+    state: State | None = None
     for way in ways:
-        for value, plant, time in points if way == "up" else points[::-1]:
-            strobe = Stroboscope(plant, time)
-            part, state = _section_at(strobe, state or strobe.checked_start(x, v), transient, cycles, lyapunov)
-            rows = len(part["x"])
+        for value, strobe in points if way == "up" else points[::-1]:
+            part, state = measured(strobe, state or strobe.checked_start(*start))
+            rows = len(next(iter(part.values())))
             parts.append({"value": np.full(rows, value), "direction": np.full(rows, way), **part})
             if progress is not None:
                 progress(len(parts), len(ways) * len(points))
-    columns = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
-    section = "stroboscopic" if acting else "maxima of x"
-    return Table(columns, {"parameters": dataclasses.asdict(parameters), "swept": name, "section": section})
+    return {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
 
 
 def _section_at(
-    strobe: Stroboscope, state: tuple[float, float], transient: int, cycles: int, lyapunov: bool
-) -> tuple[dict[str, Any], tuple[float, float] | None]:
+    strobe: Stroboscope, state: State, transient: int, cycles: int, lyapunov: bool
+) -> tuple[dict[str, Any], State | None]:
     """Return one value's columns, and the state to continue from, None after a loss of contact."""
     exponent: LyapunovExponent | None = None
     try:
@@ -126,7 +210,7 @@ def _section_at(
     return part, (float(xs[-1]), float(vs[-1])) if np.isfinite(xs[-1]) else None
 
 
-def _maxima(strobe: Stroboscope, state: tuple[float, float], transient: int, cycles: int) -> FloatArray:
+def _maxima(strobe: Stroboscope, state: State, transient: int, cycles: int) -> FloatArray:
     """Return the maxima of x of an unexcited motion that follow ``transient`` of them."""
     parameters = strobe.parameters
     places = np.empty(transient + cycles)

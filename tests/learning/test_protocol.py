@@ -207,7 +207,7 @@ def test_what_is_no_action_is_refused_naming_policy_environment_and_value(return
 def test_every_decision_is_reported():
     count = []
     protocol.measure(ConstantPolicy(0.5), "half", FORCE, lambda: count.append(1))
-    assert len(count) == protocol.decisions(FORCE) == 1000
+    assert len(count) == protocol.decisions(FORCE)
 
 
 # The leaderboard ------------------------------------------------------------------------------------------------------
@@ -268,5 +268,5 @@ def test_the_protocol_takes_whatever_environments_are_listed(monkeypatch):
     # A tier that is added to ids.py needs no line here: fingerprint and episodes come from the environment.
     assert set(ids.ARGUMENTS) == set(ENVIRONMENT_IDS)
     for env_id in ENVIRONMENT_IDS:
-        assert protocol.decisions(env_id) == 1000
+        assert protocol.decisions(env_id) > 500
         assert protocol.measure(ZeroPolicy(), "passive", env_id)["suppressed"].count("1") < 100

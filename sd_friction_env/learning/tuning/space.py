@@ -127,7 +127,7 @@ _ANNEALING = (
     Dimension("log_std_start", "callback.start", low=-1.5, high=0.5),
     Dimension("log_std_end", "callback.end", low=-4.0, high=-1.5),
 )
-_FRAMES = Dimension("frame_stack", "frame_stack", "same", low=2, high=16)
+_FRAMES = Dimension("frame_stack", "frame_stack", "same", low=2, high=32)
 
 
 def search_space(algorithm: str, settings: Mapping[str, Any], fixed: Sequence[str] = ()) -> tuple[Dimension, ...]:

@@ -6,20 +6,17 @@ from typing import Any
 from sd_friction_env import ENVIRONMENT_IDS, load_pretrained
 from sd_friction_env.cli.options import UsageError
 from sd_friction_env.control.policies import (
+    FOLLOWERS,
     NetworkPolicy,
     Policy,
     VelocityFeedback,
     ZeroPolicy,
     load_policy,
-    rollout_follower,
-    threshold_follower,
 )
 from sd_friction_env.learning import evaluation, runs
 
 # On force near the best there is. On belt the belt follows the mass, which makes matters worse at any gain.
 VELOCITY_GAINS = {"force": 1.5, "belt_speed": 1.0}
-# Controllers for the belt's speed that need no gain, by their names on the command line.
-FOLLOWERS = {"threshold-follower": threshold_follower, "rollout": rollout_follower}
 
 
 def stored_agent(path: Path) -> tuple[NetworkPolicy, dict[str, Any] | None]:

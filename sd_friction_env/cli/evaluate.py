@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sd_friction_env import Table
-from sd_friction_env.cli.agents import FOLLOWERS, agent_of, check_fit, stored_agent, velocity_feedback
+from sd_friction_env.cli.agents import agent_of, check_fit, stored_agent, velocity_feedback
 from sd_friction_env.cli.options import (
     Command,
     FailedError,
@@ -25,7 +25,7 @@ from sd_friction_env.cli.options import (
     named_environment,
     numbers,
 )
-from sd_friction_env.control.policies import ConstantPolicy, Policy, ZeroPolicy
+from sd_friction_env.control.policies import FOLLOWERS, ConstantPolicy, Policy, ZeroPolicy
 from sd_friction_env.learning import classical, evaluation, grids
 
 CONTROLLERS = ("passive", "velocity-feedback", *FOLLOWERS, "constant", "classical")

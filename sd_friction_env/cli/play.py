@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from sd_friction_env.cli.agents import FOLLOWERS, agent_of, title_of
+from sd_friction_env.cli.agents import agent_of, title_of
 from sd_friction_env.cli.options import (
     Command,
     UsageError,
@@ -12,6 +12,7 @@ from sd_friction_env.cli.options import (
     environment_of,
     progress_bar,
 )
+from sd_friction_env.control.policies import FOLLOWERS
 from sd_friction_env.pictures.renderer import checked_size
 
 

@@ -19,6 +19,7 @@ from sd_friction_env.control.policies.feedback import (
     VelocityFeedback,
 )
 from sd_friction_env.control.policies.follower import (
+    FOLLOWERS,
     EstimatingFollower,
     ObservingFollower,
     ThresholdFollower,
@@ -30,6 +31,7 @@ from sd_friction_env.control.policies.network import NetworkPolicy, PolicyFileEr
 from sd_friction_env.control.policies.policy import Actions, ConstantPolicy, Policy, State, ZeroPolicy
 
 __all__ = [
+    "FOLLOWERS",
     "Actions",
     "ConstantPolicy",
     "DelayedFeedback",

@@ -233,3 +233,6 @@ def rollout_follower(env: Any) -> Feedback:
     readings = replace(follower.readings, sees_velocity=True)
     rule = ThresholdFollower(readings=readings, belt_speed=follower.belt_speed, belt_authority=follower.belt_authority)
     return replace(follower, rollout=RolloutPolicy(rule, readings=readings, model=follower.model))
+
+
+FOLLOWERS = {"threshold-follower": threshold_follower, "rollout": rollout_follower}  # that need no gain, by name

@@ -103,13 +103,14 @@ class FastPPO(PPO):
             order, divergences = torch.randperm(size), []
             for batch in torch.split(order, self.batch_size):
                 losses = self._gradient([part[batch] for part in whole], clip, clip_values)
-                divergences.append(losses["approx_kl"])
+                divergences.append(losses.pop("approx_kl"))
                 for name, value in losses.items():
                     logged.setdefault(name, []).append(value)
                 if self.target_kl is not None and divergences[-1] > 1.5 * self.target_kl:
                     break
                 self.optimizer.step(self.max_grad_norm)
             self._n_updates += 1
+            logged["approx_kl"] = divergences  # of the last epoch alone
             if self.target_kl is not None and divergences[-1] > 1.5 * self.target_kl:
                 break
         for name, values in logged.items():

@@ -93,8 +93,8 @@ def _episodes(
         observations = after
     envs.close()
     seen, acted, rewards, dones = (np.stack(part) for part in zip(*kept, strict=True))
-    seen, acted = (torch.from_numpy(part.reshape(-1, part.shape[-1])) for part in (seen, acted))
-    return seen, acted, rewards, dones
+    flat = [torch.from_numpy(part.reshape(-1, part.shape[-1])) for part in (seen, acted)]
+    return flat[0], flat[1], rewards, dones
 
 
 def _fit(

@@ -1,9 +1,5 @@
 """Agents and controllers as commands name them."""
 
-import os
-import pkgutil
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,30 +7,18 @@ from sd_friction_env import ENVIRONMENT_IDS, load_pretrained
 from sd_friction_env.cli.options import UsageError
 from sd_friction_env.control.policies import (
     ConstantPolicy,
-    GradientPolicy,
     NetworkPolicy,
     Policy,
-    SamplingPolicy,
     VelocityFeedback,
     ZeroPolicy,
     load_policy,
-    rollout_follower,
-    threshold_follower,
 )
 from sd_friction_env.extras import extra
 from sd_friction_env.learning import classical, evaluation, runs
-from sd_friction_env.learning.optimal import OptimalPolicy
+from sd_friction_env.learning.controllers import MADE_FROM_ENV, imported_policy
 
 # On force near the best there is. On belt the belt follows the mass, which makes matters worse at any gain.
 VELOCITY_GAINS = {"force": 1.5, "belt_speed": 1.0}
-# Controllers made from an environment alone, by their names on the command line.
-MADE_FROM_ENV: dict[str, Callable[[Any], Policy]] = {
-    "threshold-follower": threshold_follower,
-    "rollout": rollout_follower,
-    "value-lookahead": OptimalPolicy.from_env,
-    "sampling-mpc": SamplingPolicy.from_env,
-    "gradient-mpc": GradientPolicy.from_env,
-}
 CONSTANTS = {"passive": ZeroPolicy(), "constant-1": ConstantPolicy(-1.0), "constant+1": ConstantPolicy(1.0)}
 NAMED = ("pretrained", "classical", "velocity-feedback", *MADE_FROM_ENV, *CONSTANTS)
 AGENTS_TEXT = f"{', '.join(NAMED)}, a run folder, a policy's .npz, an .onnx, or module:NAME"
@@ -102,36 +86,11 @@ def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
             from sd_friction_env.learning import export
         return export.ExportedPolicy.load(path, evaluation.make_env(env_id))
     if ":" in name and not path.exists():
-        return imported_policy(name, env_id)
+        return imported_policy(name, evaluation.make_env(env_id))
     if path.suffix.lower() != ".npz" and not path.is_dir():
         raise UsageError(f"the agent must be {AGENTS_TEXT}, got {name!r}")
     policy, _ = stored_agent(path)
     check_fit(path, policy, env_id, {})
-    return policy
-
-
-def imported_policy(name: str, env_id: str) -> Policy:
-    """Return the policy of a user: module:NAME, from the current folder or an installed package.
-
-    NAME is a policy, a class of policies (made by its ``from_env(env)`` if it has one, otherwise without arguments), or
-    a function of the environment that returns one.
-
-    Raises:
-        ValueError: if it cannot be imported, or gives no policy.
-    """
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    try:
-        made = pkgutil.resolve_name(name)
-    except Exception as error:  # whatever the user's module raises
-        raise UsageError(f"{name!r} cannot be imported: {type(error).__name__}: {error}") from error
-    if isinstance(made, type):
-        made = made.from_env(evaluation.make_env(env_id)) if hasattr(made, "from_env") else made()
-    elif callable(made) and not hasattr(made, "predict"):
-        made = made(evaluation.make_env(env_id))
-    if not callable(getattr(made, "predict", None)):
-        raise UsageError(f"{name!r} must be or make a policy with a method predict, got {made!r}")
-    policy: Policy = made
     return policy
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sd_friction_env import Table
-from sd_friction_env.cli.agents import AGENTS_TEXT, MADE_FROM_ENV, agent_of, check_fit, stored_agent, velocity_feedback
+from sd_friction_env.cli.agents import AGENTS_TEXT, agent_of, check_fit, stored_agent, velocity_feedback
 from sd_friction_env.cli.options import (
     Command,
     FailedError,
@@ -27,6 +27,7 @@ from sd_friction_env.cli.options import (
 )
 from sd_friction_env.control.policies import ConstantPolicy, Policy, ZeroPolicy
 from sd_friction_env.learning import classical, evaluation, grids
+from sd_friction_env.learning.controllers import MADE_FROM_ENV
 
 CONTROLLERS = ("passive", "velocity-feedback", *MADE_FROM_ENV, "constant", "classical")
 

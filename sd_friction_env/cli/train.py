@@ -35,6 +35,8 @@ _SETTINGS = (
     "env_id",
     "env_arg",
     "algo",
+    "start_from",
+    "implementation",
     "seed",
     "timesteps",
     "envs",
@@ -45,7 +47,17 @@ _SETTINGS = (
     "eval_freq",
     "eval_episodes",
 )
-_PLANNED = ("timesteps", "envs", "seed", "eval_freq", "eval_episodes", "device", "threads")
+_PLANNED = (
+    "start_from",
+    "implementation",
+    "timesteps",
+    "envs",
+    "seed",
+    "eval_freq",
+    "eval_episodes",
+    "device",
+    "threads",
+)
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -53,6 +65,13 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_environment(what)
     how = parser.add_argument_group("how")
     how.add_argument("--algo", choices=ALGORITHMS, help="algorithm")
+    text = (
+        "start with a clone of a controller (PPO): threshold-follower, rollout, a policy's .npz, or MODULE:NAME, with "
+        "the numbers of agents/hyperparameters/ppo_warm_start.yml"
+    )
+    how.add_argument("--start-from", metavar="CONTROLLER", help=text)
+    text = "of the algorithm (default: fast, where it is possible: PPO on the CPU)"
+    how.add_argument("--implementation", choices=("fast", "stable-baselines3"), help=text)
     how.add_argument("--seed", type=int, help="of everything random (default: 0)")
     how.add_argument("--timesteps", type=int, metavar="N", help="environment steps (default: the file's n_timesteps)")
     how.add_argument("--envs", type=int, metavar="N", help="environments side by side (default: the file's n_envs)")
@@ -141,7 +160,8 @@ def _train(options: argparse.Namespace) -> int:
     from sd_friction_env.learning import training
 
     what = "Resuming" if found else "Training"
-    print(f"{what} {plan.algorithm} on {plan.env_id}: {plan.steps:,} steps, seed {plan.seed}, in {folder}")
+    start = f", started from {plan.start_from}" if plan.start_from else ""
+    print(f"{what} {plan.algorithm} on {plan.env_id}: {plan.steps:,} steps, seed {plan.seed}{start}, in {folder}")
     go_on = f"continue with: sd-friction train --run-folder {shlex.quote(str(folder))} --resume"
     try:
         with stop_requests() as should_stop, warnings.catch_warnings():

@@ -22,6 +22,7 @@ from sd_friction_env.environments.sb3 import SDFrictionVecEnv
 from sd_friction_env.environments.wrappers import scaled_reward
 from sd_friction_env.learning.networks import ALGORITHM_CLASSES, policy_arguments
 from sd_friction_env.learning.plan import Plan, training_seed
+from sd_friction_env.learning.ppo import FastPPO
 from sd_friction_env.learning.settings import OURS, SCHEDULED, annealing, reward_scaling
 
 _NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
@@ -48,17 +49,18 @@ def make_training_envs(
     *,
     frame_stack: int = 1,
     scaling: tuple[float, float] = (1.0, 1.0),
+    stagger: bool = True,
 ) -> VecEnv:
     """Return seeded environments to train on: a native batch, rewards scaled, observations stacked.
 
-    The first episodes are shortened, each by another share. The environments then never start over all at once, and
-    every batch holds squealing, settling and settled motion.
+    Unless ``stagger`` is False, the first episodes are shortened, each by another share. The environments then never
+    start over all at once, and every batch holds squealing, settling and settled motion.
 
     Args:
         seed: of the run; environment i is reset with ``training_seed(seed, i)``.
         frame_stack: observations seen at once. scaling: scale and power of the rewards that the algorithm sees.
     """
-    envs: VecEnv = SDFrictionVecEnv(env_id, n_envs, stagger=True, **env_kwargs)
+    envs: VecEnv = SDFrictionVecEnv(env_id, n_envs, stagger=stagger, **env_kwargs)
     if scaling != (1.0, 1.0):
         envs = _ScaledRewards(envs, *scaling)
     if frame_stack > 1:
@@ -78,7 +80,8 @@ def make_model(plan: Plan, envs: VecEnv) -> BaseAlgorithm:
         std = plan.hyperparameters.get("noise_std", 0.1)
         one: ActionNoise = _NOISES[noise](mean=np.zeros(1), sigma=np.full(1, std))
         arguments["action_noise"] = VectorizedActionNoise(one, envs.num_envs) if envs.num_envs > 1 else one
-    model = ALGORITHM_CLASSES[plan.algorithm](
+    is_fast = plan.implementation == "fast"
+    model = (FastPPO if is_fast else ALGORITHM_CLASSES[plan.algorithm])(
         "MlpPolicy",
         envs,
         policy_kwargs=policy_arguments(plan.hyperparameters.get("policy_kwargs", {})),

@@ -10,6 +10,7 @@ from typing import Any
 
 from sd_friction_env import ENVIRONMENT_IDS
 from sd_friction_env.learning import evaluation
+from sd_friction_env.learning.controllers import check_teacher
 from sd_friction_env.learning.runs import CONFIG, RunFolderError
 from sd_friction_env.learning.settings import (
     ALGORITHMS,
@@ -23,6 +24,8 @@ from sd_friction_env.learning.settings import (
 from sd_friction_env.physics.parameters import checked_choice
 
 LARGEST_SEED = 2**32 - 1
+FAST, PLAIN = IMPLEMENTATIONS = ("fast", "stable-baselines3")
+_FAST_FOR = ("ppo", "cpu")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +40,8 @@ class Plan:
         eval_freq: environment steps between two evaluations.
         eval_episodes: episodes of each, from ``evaluation.VALIDATION_SEEDS``.
         device: as torch names it. threads: of torch.
+        implementation: of the algorithm: "fast" (:class:`FastPPO`: PPO on the CPU) or "stable-baselines3".
+        start_from: the controller whose clone PPO starts with (see :func:`teacher_of`); None: random weights.
     """
 
     env_id: str
@@ -48,6 +53,8 @@ class Plan:
     eval_episodes: int
     device: str
     threads: int
+    implementation: str = PLAIN
+    start_from: str | None = None
 
     @property
     def steps(self) -> int:
@@ -66,7 +73,8 @@ class Plan:
 
     def configuration(self) -> dict[str, Any]:
         """Return the plan as a run's config.json stores it (JSON values)."""
-        return {
+        more = {"implementation": self.implementation, "start_from": self.start_from}  # left out: as before they were
+        return {name: value for name, value in more.items() if value not in (None, PLAIN)} | {
             "environment": {"id": self.env_id, "kwargs": dict(self.env_kwargs), "frame_stack": self.frames},
             "algorithm": self.algorithm,
             "hyperparameters": dict(self.hyperparameters),
@@ -100,6 +108,8 @@ def make_plan(
     eval_episodes: int = 50,
     device: str = "cpu",
     threads: int = 1,
+    implementation: str | None = None,
+    start_from: str | None = None,
 ) -> Plan:
     """Return a checked plan; nothing is written.
 
@@ -107,13 +117,14 @@ def make_plan(
         overrides: hyperparameters that replace those of the file.
         timesteps, envs: replace ``n_timesteps`` and ``n_envs``.
         eval_freq: None: a twentieth of the steps.
+        implementation: None: "fast" where it is possible.
         The others are those of :class:`Plan`.
 
     Raises:
         TypeError, ValueError: naming the argument, its value and what is allowed.
     """
     checked_choice("env-id", env_id, ENVIRONMENT_IDS)
-    settings = read_hyperparameters(algorithm, env_id, hyperparameter_file)
+    settings = read_hyperparameters(algorithm, env_id, hyperparameter_file, warm=start_from is not None)
     settings |= check_hyperparameters(algorithm, dict(overrides or {}))
     for name, shown, value in (("n_timesteps", "timesteps", timesteps), ("n_envs", "envs", envs)):
         if value is not None:
@@ -128,6 +139,8 @@ def make_plan(
         eval_episodes=eval_episodes,
         device=device,
         threads=threads,
+        implementation=implementation or (FAST if (algorithm, device) == _FAST_FOR else PLAIN),
+        start_from=start_from,
     )
     return _checked(plan)
 
@@ -151,6 +164,8 @@ def plan_of(config: Mapping[str, Any]) -> Plan:
             eval_episodes=config["evaluation"]["episodes"],
             device=config["device"],
             threads=config["threads"],
+            implementation=config.get("implementation", PLAIN),
+            start_from=config.get("start_from"),
         )
         return _checked(plan)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -161,6 +176,15 @@ def _checked(plan: Plan) -> Plan:
     """Return a plan whose hyperparameters are checked one by one already, after checking the rest."""
     kwargs = _checked_environment(plan.env_id, plan.env_kwargs)
     _check_device(plan.device)
+    checked_choice("implementation", plan.implementation, IMPLEMENTATIONS)
+    if plan.implementation == FAST and (plan.algorithm, plan.device) != _FAST_FOR:
+        raise ValueError(f"implementation {FAST!r} is for ppo on the cpu, got {plan.algorithm} on {plan.device!r}")
+    if (plan.start_from is None) != ("warm_start" not in plan.hyperparameters):
+        raise ValueError("start-from and the hyperparameter warm_start go together: give both or none")
+    if plan.start_from is not None:
+        if plan.implementation != FAST:
+            raise ValueError(f"start-from is for the implementation {FAST!r}, got {plan.implementation!r}")
+        check_teacher(plan.start_from, plan.env_id, kwargs)
     return dataclasses.replace(
         plan,
         env_kwargs=kwargs,

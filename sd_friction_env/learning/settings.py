@@ -126,6 +126,12 @@ def _callback(name: str, value: Any) -> Any:
     return value
 
 
+def _warm_start(name: str, value: Any) -> dict[str, Any]:
+    if not isinstance(value, Mapping) or set(value) != set(_WARM_START):
+        raise ValueError(f"{name} must have the entries {', '.join(_WARM_START)}, got {brief_repr(value)}")
+    return {part: _WARM_START[part](f"{name}'s {part}", value[part]) for part in _WARM_START}
+
+
 def reward_scaling(settings: Mapping[str, Any]) -> tuple[float, float]:
     """Return scale and power of the rewards in checked hyperparameters (see :class:`ScaledReward`)."""
     arguments = (_arguments(settings.get("env_wrapper", []), WRAPPER) or [{"scale": 1.0}])[0]
@@ -211,6 +217,12 @@ _POLICY: dict[str, Check] = {
 # The table ------------------------------------------------------------------------------------------------------------
 
 _POSITIVE, _SHARE = _whole(1, 10**12), _number(0.0, 1.0)
+_WARM_START: dict[str, Check] = {
+    **dict.fromkeys(("n_envs", "n_steps", "samples", "batch_size"), _whole(2, 10**6)),
+    **dict.fromkeys(("actor_steps", "critic_steps"), _whole(0, 10**9)),
+    **dict.fromkeys(("noise", "scatter"), _number(0.0, 10.0)),
+    "learning_rate": _SHARE,
+}
 # Who takes each hyperparameter, and its check. Those of the first block are this package's and RL Zoo's, the others are
 # arguments of Stable-Baselines3's classes.
 _SETTINGS: dict[str, tuple[Sequence[str], Check]] = {
@@ -223,6 +235,7 @@ _SETTINGS: dict[str, tuple[Sequence[str], Check]] = {
     "noise_type": (OFF_POLICY, _one_of(*NOISES)),
     "policy": (ALGORITHMS, _one_of("MlpPolicy")),
     "policy_kwargs": (ALGORITHMS, lambda _, value: parse_policy_kwargs(value)),
+    "warm_start": (("ppo",), _warm_start),
     #
     "batch_size": (ALGORITHMS, _whole(2, 10**9)),
     "buffer_size": (OFF_POLICY, _POSITIVE),
@@ -280,17 +293,23 @@ def check_hyperparameters(algorithm: str, settings: Mapping[str, Any]) -> dict[s
     return {name: check_hyperparameter(name, value) for name, value in settings.items()}
 
 
-def read_hyperparameters(algorithm: str, env_id: str, path: Path | None = None) -> dict[str, Any]:
+def read_hyperparameters(
+    algorithm: str, env_id: str, path: Path | None = None, *, warm: bool = False
+) -> dict[str, Any]:
     """Return the checked hyperparameters of an environment from an RL Zoo file.
 
     Args:
         algorithm: one of ``ALGORITHMS``. env_id: a key of the file. path: of the file; None: the one shipped.
+        warm: whether the one shipped is that of agents that start from a controller.
 
     Raises:
-        ValueError: if the algorithm is unknown, the file cannot be read or a value is not allowed, naming it.
+        ValueError: if the algorithm is unknown or cannot start from a controller, the file cannot be read or a value is
+            not allowed, naming it.
     """
     checked_choice("algo", algorithm, ALGORITHMS)
-    file = HYPERPARAMETERS / f"{algorithm}.yml" if path is None else path
+    if warm and algorithm != "ppo":
+        raise ValueError(f"start-from is for ppo, got {algorithm!r}")
+    file = HYPERPARAMETERS / f"{algorithm}{'_warm_start' if warm else ''}.yml" if path is None else path
     try:
         content = read_yaml(file)
     except (OSError, StoredFileError) as error:

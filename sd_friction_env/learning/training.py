@@ -29,8 +29,10 @@ from sd_friction_env.learning import checkpoints, evaluation, runs
 from sd_friction_env.learning.models import make_callbacks, model_of
 from sd_friction_env.learning.networks import network_policy
 from sd_friction_env.learning.plan import Plan, check_same, checked_freq
+from sd_friction_env.learning.ppo import FastPPO
 from sd_friction_env.learning.tensors import save_tensors
 from sd_friction_env.learning.versions import versions as versions_of
+from sd_friction_env.learning.warm_start import warm_start
 
 Row = dict[str, Any]
 
@@ -372,6 +374,8 @@ def _learn(supervisor: _Supervisor, model: BaseAlgorithm, checkpoint: tuple[Path
     try:
         if checkpoint is not None:
             supervisor.restore(*checkpoint, logger)
+        elif isinstance(model, FastPPO) and plan.start_from is not None:
+            warm_start(model, plan)
         model.learn(
             plan.steps - (resumed_at or 0),
             callback=[*make_callbacks(plan.hyperparameters), supervisor],

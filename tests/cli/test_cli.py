@@ -296,7 +296,7 @@ def test_the_hyperparameters_are_where_it_says(capsys):
     assert main(["hyperparameters", "ppo", "--show"]) == 0
     assert capsys.readouterr().out.strip() == file.read_text().strip()
     assert main(["hyperparameters", "magic"]) == 2
-    assert "algorithm must be one of ppo, sac, td3, tqc, got 'magic'" in capsys.readouterr().err
+    assert "algorithm must be one of ppo, ppo_warm_start, sac, td3, tqc, got 'magic'" in capsys.readouterr().err
 
 
 def test_the_doctor_finds_what_is_there_and_what_is_missing(monkeypatch, capsys):

@@ -11,7 +11,7 @@ from gymnasium.envs.registration import register
 from sd_friction_env.environments.ids import ARGUMENTS, ENVIRONMENT_IDS
 
 if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out for type checkers
-    from sd_friction_env.control import policies
+    from sd_friction_env.control import observed, observers, policies
     from sd_friction_env.control.policies import load_policy
     from sd_friction_env.control.pretrained import load_pretrained
     from sd_friction_env.environments.batch import SDFrictionVectorEnv
@@ -105,6 +105,8 @@ _PUBLIC = {
 }
 _MODULES = {
     "forced": "physics.forced",
+    "observed": "control.observed",
+    "observers": "control.observers",
     "plotting": "pictures.plotting",
     "policies": "control.policies",
     "sweeps": "physics.sweeps",
@@ -147,6 +149,8 @@ __all__ = [
     "limit_cycle",
     "load_policy",
     "load_pretrained",
+    "observed",
+    "observers",
     "plotting",
     "policies",
     "read_rig",

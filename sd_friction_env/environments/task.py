@@ -250,6 +250,14 @@ class Task:
             v_scale=0.5 * nominal.belt_speed if self.v_scale is None else self.v_scale,
         )
 
+    @property
+    def scales(self) -> tuple[float, float, float]:
+        """``x_offset``, ``x_scale`` and ``v_scale`` of an environment's task, where none is None."""
+        assert self.x_offset is not None
+        assert self.x_scale is not None
+        assert self.v_scale is not None
+        return self.x_offset, self.x_scale, self.v_scale
+
     def draws(self, keys: IntegerArray, episodes: IntegerArray) -> dict[str, FloatArray]:
         """Return the values drawn for the randomised parameters of n episodes, by name, each (n,).
 
@@ -269,12 +277,10 @@ class Task:
 
     def random_states(self, keys: IntegerArray, episodes: IntegerArray) -> tuple[FloatArray, FloatArray]:
         """Return the states x and v, each (n,), at which n episodes with the start "random" begin."""
-        assert self.x_offset is not None
-        assert self.x_scale is not None
-        assert self.v_scale is not None
+        x_offset, x_scale, v_scale = self.scales
         x_share = 2.0 * kernel.random_uniforms(keys, episodes, 0, _X_SLOT) - 1.0
         v_share = 2.0 * kernel.random_uniforms(keys, episodes, 0, _V_SLOT) - 1.0
-        return self.x_offset + 3.0 * self.x_scale * x_share, 4.0 * self.v_scale * v_share
+        return x_offset + 3.0 * x_scale * x_share, 4.0 * v_scale * v_share
 
     def drawn_parameters(self, nominal: OscillatorParameters, key: int, episode: int) -> OscillatorParameters:
         """Return an episode's parameters: the nominal ones with the randomised ones drawn."""

@@ -1,5 +1,6 @@
 """Controllers by name: made from an environment alone, or of a user's module, and those that an agent starts from."""
 
+import functools
 import os
 import pkgutil
 import sys
@@ -10,6 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sd_friction_env.control.observed import ObservedNetwork, ObservedPolicy, ObservedRollout, ObservedRule
+from sd_friction_env.control.observers import (
+    AlphaBetaFilter,
+    EnsembleKalmanFilter,
+    KalmanFilter,
+    Observer,
+    ParticleFilter,
+)
 from sd_friction_env.control.policies import (
     GradientPolicy,
     Policy,
@@ -19,8 +28,27 @@ from sd_friction_env.control.policies import (
     rollout_follower,
     threshold_follower,
 )
+from sd_friction_env.control.pretrained import load_pretrained
+from sd_friction_env.environments.ids import environment_id
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.optimal import OptimalPolicy
+
+_OBSERVERS: dict[str, type[Observer]] = {
+    "alpha-beta": AlphaBetaFilter,
+    "particle": ParticleFilter,
+    "ensemble": EnsembleKalmanFilter,
+    "kalman": KalmanFilter,
+}
+
+
+def _observed(observer: str, controller: str, env: Any) -> ObservedPolicy:
+    """Return the rule, its look-ahead or the trained agent ("rule", "rollout", "agent") on an observer of a name."""
+    found = _OBSERVERS[observer].from_env(env)
+    if controller == "agent":
+        tier = "randomised" if found.ensemble.names else "nominal"
+        return ObservedNetwork(found, load_pretrained(environment_id("belt", tier)))
+    return (ObservedRule if controller == "rule" else ObservedRollout).from_env(env, found)
+
 
 MADE_FROM_ENV: dict[str, Callable[[Any], Policy]] = {
     "threshold-follower": threshold_follower,
@@ -28,6 +56,11 @@ MADE_FROM_ENV: dict[str, Callable[[Any], Policy]] = {
     "value-lookahead": OptimalPolicy.from_env,
     "sampling-mpc": SamplingPolicy.from_env,
     "gradient-mpc": GradientPolicy.from_env,
+    **{
+        f"{observer}-{controller}": functools.partial(_observed, observer, controller)
+        for observer in _OBSERVERS
+        for controller in ("rule", *(() if observer == "alpha-beta" else ("rollout", "agent")))
+    },
 }
 
 

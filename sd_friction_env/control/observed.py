@@ -1,0 +1,144 @@
+"""Controllers that act on what an observer believes: the rule, its look-ahead, and trained networks."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sd_friction_env.control.observers import Belief, Observer
+from sd_friction_env.control.policies import Actions, Policy, Readings, State, ThresholdFollower
+from sd_friction_env.physics.parameters import checked_count
+
+_Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ObservedPolicy:
+    """Base: corrects an observer by each observation, decides on its belief, and advances it by the action.
+
+    Attributes:
+        observer: of the environment.
+    """
+
+    observer: Observer
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: State = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, State]:
+        """Return the actions and the memory; see :mod:`sd_friction_env.control.policies`."""
+        own, others = (None, None) if state is None else (state[:3], state[3:] or None)
+        belief, own = self.observer.correct(observation, own, episode_start)
+        actions, others = self._decide(belief, others, episode_start)
+        actions = _taken(actions)
+        return actions.astype(np.float32)[..., None], (*self.observer.advance(own, actions), *(others or ()))
+
+    def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
+        """Return actions, shape (...), not yet clipped, and a memory of the controller's own."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class ObservedRule(ObservedPolicy):
+    """:class:`ThresholdFollower` at the believed mean velocity and nominal belt speed.
+
+    Attributes:
+        rule: its numbers; its belt speed is replaced by the believed one.
+    """
+
+    rule: ThresholdFollower
+
+    @classmethod
+    def from_env(cls, env: Any, observer: Observer, **named: Any) -> Self:
+        """Return the controller of an environment with an observer; ``named`` are numbers of the class.
+
+        Raises:
+            ValueError: if the actuator is not the belt's speed or has no authority.
+        """
+        readings = replace(Readings.from_env(env), sees_velocity=True)
+        bare = env.unwrapped
+        speeds = {"belt_speed": bare.nominal.belt_speed, "belt_authority": bare.task.belt_authority}
+        return cls(observer, ThresholdFollower(readings=readings, **speeds), **named)
+
+    def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
+        states, parameters = belief.mean
+        return self._follow(states, parameters), None
+
+    def _follow(self, states: _Floats, parameters: _Floats) -> _Floats:
+        return self.rule.follow(states[..., 1], self.observer.belt_speed(parameters))
+
+
+@dataclass(frozen=True)
+class ObservedRollout(ObservedRule):
+    """Rollout of the rule on some of the guesses: the first action with the greatest mean return over them.
+
+    As :class:`RolloutPolicy`, on plants and states that are believed possible; each goes on by the rule with its own
+    velocity and belt speed.
+
+    Attributes:
+        guesses: that are tried, in [1, 1000]: at even shares of the weights.
+        candidates: evenly spaced first actions beside the rule's own, in [2, 1000].
+        horizon: control intervals that are looked ahead, in [1, 10000].
+    """
+
+    guesses: int = 12
+    candidates: int = 5
+    horizon: int = 50
+
+    def __post_init__(self) -> None:
+        for name, bounds in (("guesses", (1, 1000)), ("candidates", (2, 1000)), ("horizon", (1, 10_000))):
+            object.__setattr__(self, name, checked_count(name, getattr(self, name), *bounds))
+
+    def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
+        own = _taken(super()._decide(belief, state, starts)[0])
+        first = np.empty((*own.shape, self.candidates + 1))
+        first[..., 0], first[..., 1:] = own, np.linspace(-1.0, 1.0, self.candidates)
+        shares = (np.arange(min(self.guesses, belief.weights.shape[-1])) + 0.5) / self.guesses
+        before = np.cumsum(belief.weights, axis=-1)[..., None, :] < shares[:, None]
+        places = np.minimum(before.sum(axis=-1), belief.weights.shape[-1] - 1)[..., None]
+        # One row of candidates for each guess.
+        now, parameters = (
+            np.repeat(np.take_along_axis(each, places, axis=-2)[..., None, :], self.candidates + 1, axis=-2)
+            for each in (belief.states, belief.parameters)
+        )
+        actions = np.broadcast_to(first[..., None, :], now.shape[:-1])
+        total = np.zeros(now.shape[:-1])
+        for _ in range(self.horizon):
+            now, rewards = self.observer.ensemble.step(now, parameters, actions)
+            total += rewards
+            actions = _taken(self._follow(now, parameters))
+        best = np.argmax(np.nan_to_num(total, nan=-1e9).mean(axis=-2), axis=-1)
+        chosen: _Floats = np.take_along_axis(first, best[..., None], axis=-1)[..., 0]
+        return chosen, None
+
+
+@dataclass(frozen=True)
+class ObservedNetwork(ObservedPolicy):
+    """A policy that reads the whole state, as the trained agents do, on the believed mean.
+
+    Attributes:
+        policy: of an environment with the sensor "state" and the same scales.
+    """
+
+    policy: Policy = field(repr=False)
+
+    def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
+        task = self.observer.ensemble.task
+        states, parameters = belief.mean
+        x_offset, x_scale, v_scale = task.scales
+        seen = [(states[..., 0] - x_offset) / x_scale, states[..., 1] / v_scale]
+        if task.actuator == "belt_speed":
+            seen.append((states[..., 2] / self.observer.belt_speed(parameters) - 1.0) / task.belt_authority)
+        limit = task.observation_limit
+        observation = np.clip(np.stack(seen, axis=-1), -limit, limit).astype(np.float32)
+        actions, state = self.policy.predict(observation, state, starts)
+        return np.asarray(actions, np.float64)[..., 0], state
+
+
+def _taken(actions: _Floats) -> _Floats:
+    """Return actions as the environment takes them: clipped, in single precision."""
+    return np.clip(actions, -1.0, 1.0).astype(np.float32).astype(np.float64)

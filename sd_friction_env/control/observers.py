@@ -1,0 +1,498 @@
+"""Observers: the state and the hidden parameters, estimated from readings and the actions taken.
+
+An observer knows the nominal plant, the task (ranges of the hidden parameters, how episodes start, the sensor's noise
+and delay) and the actions. Of an episode it gets the readings alone. All share two methods::
+
+    belief, memory = observer.correct(observation, memory, episode_start)
+    memory = observer.advance(memory, action)
+
+``memory`` is None before the first call. Observations come as the environment returns them, one or a batch; each of a
+batch is observed as it would be alone.
+"""
+
+import dataclasses
+import functools
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Any, ClassVar, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sd_friction_env.control.policies.policy import broadcast_starts, checked_memory
+from sd_friction_env.environments.batch import SDFrictionVectorEnv
+from sd_friction_env.environments.ensemble import Ensemble
+from sd_friction_env.environments.jacobian import step_with_jacobian
+from sd_friction_env.physics.parameters import EXCITATIONS, checked_count, checked_number
+
+_Floats = NDArray[np.float64]
+Memory = tuple[NDArray[Any], ...]
+
+_LEAST_NOISE = 1e-3  # of a reading: more exact ones leave too few particles of weight
+_ON_BELT = 1e-9  # a correction moves a mass off the belt by rounding alone
+
+
+class Belief(NamedTuple):
+    """What an observer believes: k weighted guesses of the state and the hidden parameters, one for a mere estimate.
+
+    Attributes:
+        states: (x, v, v_belt), shape (..., k, 3).
+        parameters: the hidden ones, shape (..., k, d).
+        weights: of the guesses, shape (..., k); their sum is 1.
+    """
+
+    states: _Floats
+    parameters: _Floats
+    weights: _Floats
+
+    @property
+    def mean(self) -> tuple[_Floats, _Floats]:
+        """Mean state, shape (..., 3), and mean parameters, shape (..., d)."""
+        weights = self.weights[..., None]
+        return (self.states * weights).sum(axis=-2), (self.parameters * weights).sum(axis=-2)
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Base of the observers.
+
+    A guess is one row: x, v, v_belt, the hidden parameters, and the x (and v, if it is read) of the last
+    ``sensor_delay`` + 1 intervals, oldest first. A reading then corrects the whole row by its oldest part, so that no
+    prediction over the delay is needed.
+
+    Attributes:
+        ensemble: of the plants that are possible, with the task.
+        noise: standard deviation of the readings, in [1e-6, 10].
+
+    Raises:
+        TypeError, ValueError: if a number is not as said.
+    """
+
+    ensemble: Ensemble = field(repr=False)
+    _: KW_ONLY
+    noise: float
+
+    _ranges: ClassVar[dict[str, tuple[float, float]]] = {"noise": (1e-6, 10.0)}
+    _counts: ClassVar[dict[str, tuple[int, int]]] = {}
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in self._ranges.items():
+            object.__setattr__(self, name, checked_number(name, getattr(self, name), low, high))
+        for name, (least, most) in self._counts.items():
+            object.__setattr__(self, name, checked_count(name, getattr(self, name), least, most))
+
+    @classmethod
+    def from_env(cls, env: Any, **named: Any) -> Self:
+        """Return the observer of an :class:`SDFrictionEnv`, wrapped or not; ``named`` are numbers of the class.
+
+        It knows of no excitation and of no drift.
+
+        Raises:
+            TypeError: if it is another kind of environment.
+        """
+        bare: Any = getattr(env, "unwrapped", None)
+        if not hasattr(bare, "task") or not hasattr(bare, "nominal"):
+            raise TypeError(f"env must be an SDFrictionEnv, got {env!r}")
+        hidden = (name for name in bare.task.randomise if name.partition("_")[0] not in EXCITATIONS)
+        ensemble = Ensemble(bare.nominal.unexcited, bare.task, tuple(hidden))
+        return cls(ensemble, **({"noise": max(bare.task.sensor_noise, _LEAST_NOISE)} | named))
+
+    def correct(
+        self, observation: ArrayLike, memory: Memory | None = None, episode_start: ArrayLike | None = None
+    ) -> tuple[Belief, Memory]:
+        """Return the belief after observations, shape (size,) or (n, size), and the memory.
+
+        Raises:
+            ValueError: if the observations are too short, or the memory belongs to another number of them.
+        """
+        reading = self.read(observation)
+        shape, flat = reading.shape[:-1], reading.reshape(-1, reading.shape[-1])
+        begun = np.ones(len(flat), bool)
+        steps, guesses, spread = np.zeros(len(flat), np.int64), *self._blank(len(flat))
+        if memory is not None:
+            starts = np.broadcast_to(broadcast_starts(episode_start, reading[..., 0]), shape).reshape(-1)
+            old = checked_memory(memory, steps.shape, guesses.shape, spread.shape)
+            steps, guesses, spread = np.where(starts, 0, old[0]), old[1].copy(), old[2].copy()
+            begun = steps == 0
+        # Until the delay has passed, the sensor repeats its first reading.
+        new = steps > self.ensemble.task.sensor_delay
+        if begun.any():
+            guesses[begun], spread[begun] = self._begin(flat[begun])
+        if new.any():
+            guesses[new], spread[new] = self._update(flat[new], guesses[new], spread[new], steps[new])
+        states, parameters, weights = guesses[..., :3], guesses[..., 3 : self._first], self._weights(guesses, spread)
+        parts = (part.reshape(*shape, *part.shape[1:]) for part in (states, parameters, weights))
+        return Belief(*parts), (steps, guesses, spread)
+
+    def advance(self, memory: Memory, action: ArrayLike) -> Memory:
+        """Return the memory a control interval later, after actions in [-1, 1], shape () or (n,)."""
+        steps, guesses, spread = memory
+        held = np.repeat(np.reshape(np.asarray(action, np.float64), (-1, 1)), guesses.shape[1], axis=1)
+        ends, spread = self._step(guesses, held, spread)
+        return steps + 1, ends, spread
+
+    def read(self, observation: ArrayLike) -> _Floats:
+        """Return the readings of observations: x, and v and the belt modulation where they are seen, shape (..., s)."""
+        task, values = self.ensemble.task, np.asarray(observation, dtype=np.float64)
+        size = self._seen + task.sees_belt
+        if values.ndim < 1 or values.shape[-1] < size:
+            raise ValueError(f"observation must have at least {size} entries, got shape {values.shape}")
+        values, (x_offset, x_scale, v_scale) = values[..., :size].copy(), task.scales
+        values[..., 0] = values[..., 0] * x_scale + x_offset
+        values[..., 1 : self._seen] *= v_scale
+        return values
+
+    def belt_speed(self, parameters: _Floats) -> _Floats:
+        """Return the nominal belt speed, shape (...), among hidden parameters (..., d) or as it is known."""
+        names = self.ensemble.names
+        if "belt_speed" in names:
+            return parameters[..., names.index("belt_speed")]
+        return np.full(parameters.shape[:-1], self.ensemble.nominal.belt_speed)
+
+    # Rows of guesses --------------------------------------------------------------------------------------------------
+
+    @property
+    def _seen(self) -> int:
+        """How much of (x, v) the sensor sees."""
+        return 2 if self.ensemble.task.sensor == "state" else 1
+
+    @property
+    def _first(self) -> int:
+        """The first column of the past."""
+        return 3 + len(self.ensemble.names)
+
+    @property
+    def _width(self) -> int:
+        return self._first + self._seen * (self.ensemble.task.sensor_delay + 1)
+
+    def _row(self, now: _Floats, past: _Floats | None = None) -> _Floats:
+        """Return guesses from their present, shape (..., first column of the past), and the past before it, if any."""
+        seen = now[..., : self._seen]
+        if past is None:
+            return np.concatenate([now, *[seen] * (self.ensemble.task.sensor_delay + 1)], axis=-1)
+        return np.concatenate([now, past[..., self._seen :], seen], axis=-1)
+
+    def _expected(self, guesses: _Floats) -> _Floats:
+        """Return the readings that guesses expect, without noise, shape (..., k, s)."""
+        seen = guesses[..., self._first : self._first + self._seen]
+        if not self.ensemble.task.sees_belt:
+            return seen
+        ratio = guesses[..., 2] / self.belt_speed(guesses[..., 3 : self._first])
+        return np.concatenate([seen, ((ratio - 1.0) / self.ensemble.task.belt_authority)[..., None]], axis=-1)
+
+    def _admissible(self, guesses: _Floats, stuck: NDArray[np.bool_]) -> _Floats:
+        """Put corrected guesses back into the ranges of the parameters, and those that stuck on the belt."""
+        for i, name in enumerate(self.ensemble.names):
+            guesses[..., 3 + i] = np.clip(guesses[..., 3 + i], *self.ensemble.task.randomise[name])
+        guesses[..., 1] = np.where(stuck, guesses[..., 2], guesses[..., 1])
+        return guesses
+
+    def _step(self, guesses: _Floats, actions: _Floats, spread: _Floats) -> tuple[_Floats, _Floats]:
+        now = guesses[..., : self._first]
+        ends, _ = self.ensemble.step(now[..., :3], now[..., 3:], actions)
+        # A guess that cannot be advanced stays where it is.
+        ends = np.where(np.isfinite(ends).all(axis=-1, keepdims=True), ends, now[..., :3])
+        return self._row(np.concatenate([ends, now[..., 3:]], axis=-1), guesses[..., self._first :]), spread
+
+    # Of each observer -------------------------------------------------------------------------------------------------
+
+    def _blank(self, n: int) -> tuple[_Floats, _Floats]:
+        """Return arrays for n beliefs: guesses (n, k, width), and what says how far they spread, (n, ...)."""
+        raise NotImplementedError
+
+    def _weights(self, guesses: _Floats, spread: _Floats) -> _Floats:
+        return np.ones(guesses.shape[:2])
+
+    def _begin(self, reading: _Floats) -> tuple[_Floats, _Floats]:
+        """Return guesses and spread after the first readings, shape (n, s)."""
+        raise NotImplementedError
+
+    def _update(
+        self, reading: _Floats, guesses: _Floats, spread: _Floats, steps: NDArray[np.int64]
+    ) -> tuple[_Floats, _Floats]:
+        """Return guesses and spread after readings, shape (n, s)."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class AlphaBetaFilter(Observer):
+    """Position and velocity by two constant gains, without a model of the plant, for a belt actuator.
+
+    x += x_gain e and v += v_gain e / control_interval with the reading's deviation e; between readings x moves by v.
+    The nominal belt speed is the largest of 0.9 v/(v_belt/belt_speed) so far, because a mass that sticks has the belt's
+    speed; other hidden parameters are taken for nominal. Source: Y. Bar-Shalom, X. R. Li and T. Kirubarajan,
+    Estimation with Applications to Tracking and Navigation (2001), section 6.5.
+
+    Attributes:
+        x_gain, v_gain: in [0, 2].
+    """
+
+    x_gain: float = 0.4
+    v_gain: float = 0.2
+
+    _ranges: ClassVar = {**Observer._ranges, "x_gain": (0.0, 2.0), "v_gain": (0.0, 2.0)}
+    _SHARE: ClassVar = 0.9
+
+    def _blank(self, n: int) -> tuple[_Floats, _Floats]:
+        return np.zeros((n, 1, self._width)), np.zeros((n, 0))
+
+    def _begin(self, reading: _Floats) -> tuple[_Floats, _Floats]:
+        names, task, nominal = self.ensemble.names, self.ensemble.task, self.ensemble.nominal
+        now = np.zeros((len(reading), 1, self._first))
+        now[..., 0] = reading[:, :1]
+        for i, name in enumerate(names):
+            now[..., 3 + i] = task.randomise[name][0] if name == "belt_speed" else nominal.values[name]
+        now[..., 2] = self.belt_speed(now[..., 3:])
+        return self._row(now), np.zeros((len(reading), 0))
+
+    def _update(
+        self, reading: _Floats, guesses: _Floats, spread: _Floats, steps: NDArray[np.int64]
+    ) -> tuple[_Floats, _Floats]:
+        error = reading[:, :1] - guesses[..., self._first]
+        guesses[..., 0] += self.x_gain * error
+        guesses[..., 1] += self.v_gain / self.ensemble.task.control_interval * error
+        guesses[..., self._first :: self._seen] += self.x_gain * error[..., None]
+        if "belt_speed" in self.ensemble.names:
+            column = 3 + self.ensemble.names.index("belt_speed")
+            low, high = self.ensemble.task.randomise["belt_speed"]
+            ratio = guesses[..., 2] / guesses[..., column]
+            found = np.maximum(guesses[..., column], self._SHARE * guesses[..., 1] / np.maximum(ratio, 0.1))
+            guesses[..., column] = np.clip(found, low, high)
+            guesses[..., 2] = ratio * guesses[..., column]
+        return guesses, spread
+
+    def _step(self, guesses: _Floats, actions: _Floats, spread: _Floats) -> tuple[_Floats, _Floats]:
+        task, now = self.ensemble.task, guesses[..., : self._first].copy()
+        now[..., 0] += task.control_interval * now[..., 1]
+        if task.actuator == "belt_speed":
+            most = task.belt_acceleration_limit * task.control_interval
+            target = (1.0 + task.belt_authority * actions) * self.belt_speed(now[..., 3:])
+            now[..., 2] += np.clip(target - now[..., 2], -most, most)
+        return self._row(now, guesses[..., self._first :]), spread
+
+
+@dataclass(frozen=True)
+class _FromPrior(Observer):
+    """Base of the observers that begin with episodes as the task starts them.
+
+    Attributes:
+        seed: of all random numbers; the same for every observation of a batch.
+        prior_size: number of such starts, in [2, 1e6].
+    """
+
+    seed: int = 0
+    prior_size: int = 8192
+
+    _counts: ClassVar = {"seed": (0, 2**62), "prior_size": (2, 10**6)}
+
+    @functools.cached_property
+    def prior(self) -> _Floats:
+        """Guesses before the first reading, shape (prior_size, width): starts as the task draws them."""
+        task = {each.name: getattr(self.ensemble.task, each.name) for each in dataclasses.fields(self.ensemble.task)}
+        envs = SDFrictionVectorEnv(self.prior_size, self.ensemble.nominal, **task)
+        envs.np_random = np.random.default_rng(self.seed)
+        _, info = envs.reset()
+        drawn = (info["parameters"][name] for name in self.ensemble.names)
+        return self._row(np.stack([info["x"], info["v"], info["v_belt"], *drawn], axis=-1))
+
+    def _reweighted(self, guesses: _Floats, weights: _Floats, reading: _Floats, least: float) -> _Floats:
+        """Return weights (n, k) after readings: by their likelihood, to such a power that ``least`` guesses count.
+
+        The number that count is 1 over the sum of squared weights (Kong, Liu and Wong, 1994); tempering keeps a
+        reading that few guesses expected from deciding alone.
+        """
+        errors = (self._expected(guesses) - reading[:, None, :]) / self.noise
+        likelihood = -0.5 * (errors * errors).sum(axis=-1)
+        likelihood = np.maximum(likelihood - likelihood.max(axis=-1, keepdims=True), -1e3)
+
+        def raised(power: _Floats) -> tuple[_Floats, NDArray[np.bool_]]:
+            new = weights * np.exp(power[:, None] * likelihood)
+            new /= new.sum(axis=-1, keepdims=True)
+            return new, (new * new).sum(axis=-1) * least <= 1.0
+
+        low, high = np.zeros(len(weights)), np.ones(len(weights))
+        whole, enough = raised(high)
+        if enough.all():
+            return whole
+        for _ in range(12):
+            middle = 0.5 * (low + high)
+            _, many = raised(middle)
+            low, high = np.where(many, middle, low), np.where(many, high, middle)
+        tempered, _ = raised(np.where(enough, 1.0, low))
+        return tempered
+
+
+@dataclass(frozen=True)
+class ParticleFilter(_FromPrior):
+    """Particle filter: every guess moves as its own plant, and readings decide which go on.
+
+    The environment's own step advances all particles. Where fewer than half of them count, they are drawn anew
+    (systematic resampling) and moved towards their mean and by differences of other particles, which keeps mean and
+    covariance. Source: J. Liu and M. West, in Sequential Monte Carlo Methods in Practice (2001), chapter 10.
+
+    Attributes:
+        particles: in [8, 100000].
+        jitter: share of the spread that is drawn anew, in [0, 1].
+    """
+
+    particles: int = 512
+    jitter: float = 0.35
+
+    _ranges: ClassVar = {**Observer._ranges, "jitter": (0.0, 1.0)}
+    _counts: ClassVar = {**_FromPrior._counts, "particles": (8, 100_000)}
+    _LEAST: ClassVar = 0.2  # share of the particles that a reading leaves of weight
+
+    def _blank(self, n: int) -> tuple[_Floats, _Floats]:
+        return np.zeros((n, self.particles, self._width)), np.zeros((n, self.particles))
+
+    def _weights(self, guesses: _Floats, spread: _Floats) -> _Floats:
+        return spread
+
+    def _begin(self, reading: _Floats) -> tuple[_Floats, _Floats]:
+        prior = np.broadcast_to(self.prior, (len(reading), *self.prior.shape))
+        even = np.full(prior.shape[:2], 1.0 / self.prior_size)
+        weights = self._reweighted(prior, even, reading, self._LEAST * self.particles)
+        return self._resampled(prior, weights, np.zeros(len(reading), np.int64))
+
+    def _update(
+        self, reading: _Floats, guesses: _Floats, spread: _Floats, steps: NDArray[np.int64]
+    ) -> tuple[_Floats, _Floats]:
+        weights = self._reweighted(guesses, spread, reading, self._LEAST * self.particles)
+        few = (weights * weights).sum(axis=-1) * 0.5 * self.particles > 1.0
+        if few.any():
+            guesses[few], weights[few] = self._resampled(guesses[few], weights[few], steps[few])
+        return guesses, weights
+
+    def _resampled(self, guesses: _Floats, weights: _Floats, steps: NDArray[np.int64]) -> tuple[_Floats, _Floats]:
+        """Return particles of equal weight, with those weights."""
+        n, k = len(guesses), self.particles
+        drawn = np.empty((n, k, self._width))
+        for i in range(n):
+            rng = np.random.default_rng((self.seed, int(steps[i])))
+            shares = (np.arange(k) + rng.random()) / k
+            places = np.minimum(np.searchsorted(np.cumsum(weights[i]), shares), guesses.shape[1] - 1)
+            own = guesses[i, places]
+            mean, differences = own.mean(axis=0), own[rng.permutation(k)] - own[rng.permutation(k)]
+            moved = mean + np.sqrt(1.0 - self.jitter**2) * (own - mean) + self.jitter * np.sqrt(0.5) * differences
+            drawn[i] = self._admissible(moved, own[:, 1] == own[:, 2])
+        return drawn, np.full((n, k), 1.0 / k)
+
+
+@dataclass(frozen=True)
+class EnsembleKalmanFilter(ParticleFilter):
+    """:class:`ParticleFilter` in the first steps, until it is clear where on the cycle the mass is, then an ensemble
+    Kalman filter: a reading moves all particles along their covariance with what they expected to read.
+
+    No particle is lost, so that far fewer follow the hidden parameters. No random numbers are drawn for the moves.
+    Source: J. S. Whitaker and T. M. Hamill, Mon. Weather Rev. 130 (2002) 1913, Eqs. 10 and 13.
+
+    Attributes:
+        particle_steps: steps with the particle filter, in [0, 1e9].
+        inflation: factor on the particles' deviations at each reading, in [1, 2]: it keeps the filter from becoming too
+            sure of parameters that its first steps have estimated wrongly.
+    """
+
+    particle_steps: int = 20
+    inflation: float = 1.002
+
+    _ranges: ClassVar = {**ParticleFilter._ranges, "inflation": (1.0, 2.0)}
+    _counts: ClassVar = {**ParticleFilter._counts, "particle_steps": (0, 10**9)}
+
+    def _update(
+        self, reading: _Floats, guesses: _Floats, spread: _Floats, steps: NDArray[np.int64]
+    ) -> tuple[_Floats, _Floats]:
+        early = steps <= self.particle_steps
+        if early.any():
+            guesses[early], spread[early] = super()._update(reading[early], guesses[early], spread[early], steps[early])
+        uneven = ~early & (spread.max(axis=-1) > spread.min(axis=-1))
+        if uneven.any():
+            guesses[uneven], spread[uneven] = self._resampled(guesses[uneven], spread[uneven], steps[uneven])
+        if not early.all():
+            guesses[~early] = self._moved(guesses[~early], reading[~early])
+        return guesses, spread
+
+    def _moved(self, guesses: _Floats, reading: _Floats) -> _Floats:
+        stuck = guesses[..., 1] == guesses[..., 2]
+        rows = np.concatenate([guesses, self._expected(guesses)], axis=-1)
+        mean = rows.mean(axis=1)
+        deviations = self.inflation * (rows - mean[:, None])
+        variance = self.noise * self.noise
+        for i in range(reading.shape[-1]):  # one number after the other
+            expected = deviations[..., self._width + i]
+            total = (expected * expected).mean(axis=-1) + variance
+            gain = (deviations * expected[..., None]).mean(axis=1) / total[:, None]
+            mean = mean + gain * (reading[:, i] - mean[:, self._width + i])[:, None]
+            share = 1.0 / (1.0 + np.sqrt(variance / total))
+            deviations = deviations - (share[:, None] * expected)[..., None] * gain[:, None]
+        return self._admissible((mean[:, None] + deviations)[..., : self._width], stuck)
+
+
+@dataclass(frozen=True)
+class KalmanFilter(_FromPrior):
+    """Extended Kalman filter with the exact step and its exact Jacobian, jumps at events (saltation) included.
+
+    It begins with mean and covariance of the starts that the first reading leaves of weight. Between two readings the
+    hidden parameters stay and the covariance grows by ``inflation``. Sources: A. H. Jazwinski, Stochastic Processes and
+    Filtering Theory (1970), section 8.3; N. J. Kong, J. J. Payne, G. Council and A. M. Johnson, The Salted Kalman
+    Filter, Automatica 131 (2021), for the events.
+
+    Attributes:
+        inflation: factor on the covariance in each interval, in [1, 2].
+    """
+
+    inflation: float = 1.005
+
+    _ranges: ClassVar = {**Observer._ranges, "inflation": (1.0, 2.0)}
+
+    def _blank(self, n: int) -> tuple[_Floats, _Floats]:
+        return np.zeros((n, 1, self._width)), np.zeros((n, self._width, self._width))
+
+    def _begin(self, reading: _Floats) -> tuple[_Floats, _Floats]:
+        prior = np.broadcast_to(self.prior, (len(reading), *self.prior.shape))
+        even = np.full(prior.shape[:2], 1.0 / self.prior_size)
+        weights = self._reweighted(prior, even, reading, min(64.0, self.prior_size))[..., None]
+        mean = (prior * weights).sum(axis=1, keepdims=True)
+        deviations = (prior - mean) * np.sqrt(weights)
+        return mean, np.stack([one.T @ one for one in deviations])
+
+    def _update(
+        self, reading: _Floats, guesses: _Floats, spread: _Floats, steps: NDArray[np.int64]
+    ) -> tuple[_Floats, _Floats]:
+        for i in range(reading.shape[-1]):
+            slope = self._slope(guesses[:, 0], i)
+            expected = (spread * slope[:, None, :]).sum(axis=-1)
+            gain = expected / ((expected * slope).sum(axis=-1) + self.noise * self.noise)[:, None]
+            guesses[:, 0] += gain * (reading[:, i] - self._expected(guesses)[:, 0, i])[:, None]
+            spread = spread - gain[:, :, None] * expected[:, None, :]
+        return self._admissible(guesses, np.abs(guesses[..., 1] - guesses[..., 2]) < _ON_BELT), spread
+
+    def _slope(self, guesses: _Floats, i: int) -> _Floats:
+        """Return the derivatives of the i-th number that guesses (n, width) expect to read, by the guesses."""
+        slope, names = np.zeros_like(guesses), self.ensemble.names
+        if i < self._seen:
+            slope[:, self._first + i] = 1.0
+            return slope
+        speed = self.belt_speed(guesses[:, 3 : self._first]) * self.ensemble.task.belt_authority
+        slope[:, 2] = 1.0 / speed
+        if "belt_speed" in names:
+            slope[:, 3 + names.index("belt_speed")] = -guesses[:, 2] / (
+                speed * self.belt_speed(guesses[:, 3 : self._first])
+            )
+        return slope
+
+    def _step(self, guesses: _Floats, actions: _Floats, spread: _Floats) -> tuple[_Floats, _Floats]:
+        ends, grown = np.empty_like(guesses), np.empty_like(spread)
+        first, seen, names = self._first, self._seen, self.ensemble.names
+        for i, (row, covariance) in enumerate(zip(guesses[:, 0], spread, strict=True)):
+            plant = self.ensemble.nominal.replace(**dict(zip(names, row[3:first].tolist(), strict=True)))
+            found = step_with_jacobian(row[:3], actions[i, 0], plant, self.ensemble.task, by=names)
+            known = bool(np.isfinite(found.jacobian[:3]).all())
+            state = found.state if known else row[:3]
+            ends[i, 0] = self._row(np.concatenate([state, row[3:first]]), row[first:])
+            change = np.zeros_like(covariance)
+            change[:first, :first] = np.eye(first)
+            if known:
+                change[:3, :3], change[:3, 3:first] = found.jacobian[:3, :3], found.jacobian[:3, 4:]
+            change[first:-seen, first + seen :] = np.eye(self._width - first - seen)
+            change[-seen:] = change[:seen]
+            grown[i] = self.inflation * (change @ covariance @ change.T)
+        return ends, grown

@@ -1,0 +1,262 @@
+"""Observers against what they should find: the true state and plant, a textbook filter, and each other."""
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sd_friction_env import SDFrictionVectorEnv, load_pretrained
+from sd_friction_env.control.observed import ObservedNetwork, ObservedRollout, ObservedRule
+from sd_friction_env.control.observers import (
+    AlphaBetaFilter,
+    Belief,
+    EnsembleKalmanFilter,
+    KalmanFilter,
+    ParticleFilter,
+)
+from sd_friction_env.environments.ensemble import Ensemble
+from sd_friction_env.learning import evaluation
+
+NOMINAL, RANDOMISED, SENSED = (f"SDFriction/BeltSpeed{tier}-v0" for tier in ("", "Randomised", "Sensed"))
+BLIND = {"sensor": "position", "sensor_noise": 0.005, "sensor_delay": 1}
+FILTERS = [AlphaBetaFilter, ParticleFilter, EnsembleKalmanFilter, KalmanFilter]
+SMALL = {"prior_size": 512}
+
+
+def make(env_id=RANDOMISED, **arguments):
+    return gym.make(env_id, **arguments).unwrapped
+
+
+def small(kind, env, **named):
+    return kind.from_env(env, **({} if kind is AlphaBetaFilter else SMALL), **named)
+
+
+def follow(observer, env, steps, seed=2_000_000, amplitude=1.0):
+    """The belief after an episode of given actions, and the true state and parameters."""
+    observation, info = env.reset(seed=seed)
+    memory = None
+    for t in range(steps):
+        belief, memory = observer.correct(observation, memory, t == 0)
+        action = amplitude * np.sin(0.7 * t)
+        truth = np.array([info["x"], info["v"], info["v_belt"]])
+        observation, _, _, _, info = env.step(np.array([action], np.float32))
+        memory = observer.advance(memory, float(np.float32(action)))
+    return belief, truth, np.array([getattr(env.parameters, name) for name in env.task.randomise])
+
+
+def test_an_ensemble_steps_as_the_environment_does_bit_for_bit():
+    envs = SDFrictionVectorEnv(64, actuator="belt_speed", randomise=make().task.randomise, info_keys="all")
+    _, info = envs.reset(seed=1)
+    ensemble = Ensemble(envs.nominal, envs.task, tuple(envs.task.randomise))
+    plants = np.stack([info["parameters"][name] for name in ensemble.names], axis=-1)
+    rng = np.random.default_rng(0)
+    states = np.stack([info[name] for name in ("x", "v", "v_belt")], axis=-1)
+    for _ in range(100):
+        actions = rng.uniform(-1.0, 1.0, 64).astype(np.float32)
+        states, rewards = ensemble.step(states, plants, actions.astype(float))
+        _, own, _, _, info = envs.step(actions[:, None])
+        assert states.tobytes() == np.stack([info[name] for name in ("x", "v", "v_belt")], axis=-1).tobytes()
+        assert rewards.tobytes() == own.tobytes()
+
+
+def test_a_mass_that_loses_contact_has_no_state():
+    env = make(parameters={"alpha": 0.6})
+    ensemble = Ensemble(env.nominal, env.task, ())
+    states, rewards = ensemble.step(np.array([[9.0, 0.0, 0.2], [0.3, 0.2, 0.2]]), np.empty((2, 0)), np.zeros(2))
+    lost = np.isnan(states).all(axis=-1) & np.isnan(rewards)
+    assert not lost[1]
+    reference = make(NOMINAL, parameters={"alpha": 0.6})
+    reference.reset(options={"x": 9.0, "v": 0.0})
+    assert lost[0] == reference.step(np.zeros(1, np.float32))[2]
+
+
+@pytest.mark.parametrize(
+    ("kind", "named", "x_error", "share", "finds"),
+    [
+        (KalmanFilter, {}, 5e-4, 0.02, 6),  # it begins with one guess, and may stay with a wrong one
+        (EnsembleKalmanFilter, {}, 5e-4, 0.02, 8),
+        (ParticleFilter, {"particles": 2048}, 2e-3, 0.12, 8),
+    ],
+)
+def test_without_noise_the_estimate_comes_to_the_true_state_and_plant(kind, named, x_error, share, finds):
+    env = make(**(BLIND | {"sensor_noise": 0.0}))
+    observer = kind.from_env(env, **named)
+    width = np.array([high - low for low, high in env.task.randomise.values()])
+    found = 0
+    for seed in range(2_000_000, 2_000_008):
+        belief, truth, plant = follow(observer, env, 250, seed)
+        state, estimate = belief.mean
+        near = abs(state[0] - truth[0]) < x_error and np.abs(state[1:] - truth[1:]).max() < 0.02
+        found += near and (np.abs(estimate - plant) / width).max() < share
+    assert found >= finds
+
+
+def textbook(observer, env, steps):
+    """A Kalman filter of the delayed reading in its textbook form, by the finite differences of the environment."""
+    observation, _ = env.reset(seed=2_000_000)
+    prior, delay = observer.prior, env.task.sensor_delay
+    rows, noise = prior.shape[1], observer.noise
+    memory, mean, covariance, means = None, None, None, []
+    for t in range(steps):
+        belief, memory = observer.correct(observation, memory, t == 0)
+        if t == 0:  # begins as the observer does
+            mean, covariance = memory[1][0, 0].copy(), memory[2][0].copy()
+        elif t > delay:
+            slope = np.zeros((1, rows))
+            slope[0, 3] = 1.0
+            innovation = slope @ covariance @ slope.T + noise**2
+            gain = covariance @ slope.T @ np.linalg.inv(innovation)
+            mean = mean + gain[:, 0] * (observer.read(observation)[0] - mean[3])
+            covariance = (np.eye(rows) - gain @ slope) @ covariance
+        means.append((belief.mean[0], mean[:3]))
+        action = 0.3 * np.sin(0.7 * t)
+        observation, _, _, _, _ = env.step(np.array([action], np.float32))
+        held = float(np.float32(action))
+        memory = observer.advance(memory, held)
+
+        def ahead(state, held=held):
+            return observer.ensemble.step(state[None], np.empty((1, 0)), np.array([held]))[0][0]
+
+        change = np.zeros((rows, rows))
+        for i in range(3):
+            small = 1e-5 * np.eye(3)[i]
+            change[:3, i] = (ahead(mean[:3] + small) - ahead(mean[:3] - small)) / 2e-5
+        change[3:-1, 4:] = np.eye(rows - 4)
+        change[-1] = change[0]
+        mean = np.concatenate([ahead(mean[:3]), mean[4:], ahead(mean[:3])[:1]])
+        covariance = change @ covariance @ change.T
+    return means
+
+
+def test_without_events_the_extended_filter_is_the_textbook_filter():
+    """A viscous contact (friction grows with speed) at rest: the mass slips throughout."""
+    env = make(SENSED, parameters={"friction": "coulomb", "mu_s": 0.1, "mu_k": 0.1, "belt_speed": 0.5}, start="rest")
+    env = make(
+        SENSED,
+        parameters={"friction": "coulomb", "mu_s": 0.1, "mu_k": 0.1, "belt_speed": 0.5, "beta": 0.1},
+        start="random",
+        x_scale=0.02,
+        v_scale=0.02,
+        sensor_delay=2,
+    )
+    observer = KalmanFilter.from_env(env, inflation=1.0, **SMALL)
+    for found, expected in textbook(observer, env, 60):
+        assert found == pytest.approx(expected, abs=1e-7)
+
+
+def test_many_particles_agree_with_the_kalman_filter_where_that_is_exact():
+    arguments = {
+        "parameters": {"friction": "coulomb", "mu_s": 0.1, "mu_k": 0.1, "belt_speed": 0.5, "beta": 0.1},
+        "start": "random",
+        "x_scale": 0.02,
+        "v_scale": 0.02,
+    }
+    env = make(SENSED, **arguments)
+    exact, _, _ = follow(KalmanFilter.from_env(env, inflation=1.0), env, 40, amplitude=0.3)
+    for kind in (ParticleFilter, EnsembleKalmanFilter):
+        found, truth, _ = follow(kind.from_env(env, particles=4096), env, 40, amplitude=0.3)
+        spread = np.sqrt((found.weights[:, None] * (found.states - found.mean[0]) ** 2).sum(axis=0))
+        assert np.abs(found.mean[0] - exact.mean[0])[:2].max() < 0.5 * spread[:2].max()
+        assert np.abs(found.mean[0] - truth)[:2].max() < 4.0 * spread[:2].max()
+
+
+def policies_on(env, kind):
+    observer = small(kind, env)
+    network = load_pretrained(RANDOMISED)
+    rule, rollout = (each.from_env(env, observer) for each in (ObservedRule, ObservedRollout))
+    return [rule, dataclasses.replace(rollout, horizon=5), ObservedNetwork(observer, network)]
+
+
+@pytest.mark.parametrize("kind", FILTERS)
+@pytest.mark.parametrize("arguments", [BLIND, {}], ids=["blind", "state seen"])
+def test_one_as_many_and_the_same_seed_the_same_bits(kind, arguments):
+    env = make(**arguments)
+    rng = np.random.default_rng(0)
+    observations = rng.normal(scale=0.3, size=(12, 3, env.observation_space.shape[0])).astype(np.float32)
+    begins = rng.random((12, 3)) < 0.2
+    begins[0] = True
+    for policy, again in zip(policies_on(env, kind), policies_on(env, kind), strict=True):
+        state, singles = None, [None] * 3
+        for t in range(12):
+            together, state = policy.predict(observations[t], state, begins[t])
+            for i in range(3):
+                alone, singles[i] = again.predict(observations[t, i], singles[i], begins[t, i])
+                assert alone.shape == (1,)
+                assert alone.tobytes() == together[i].tobytes()
+
+
+def test_another_seed_draws_other_particles():
+    env = make(**BLIND)
+    first, again, other = (small(ParticleFilter, env, seed=seed).prior for seed in (0, 0, 1))
+    assert first.tobytes() == again.tobytes() != other.tobytes()
+
+
+def test_weights_that_are_tempered_leave_the_share_that_is_asked_for():
+    observer = small(ParticleFilter, make(**BLIND))
+    prior = observer.prior[None]
+    weights = observer._reweighted(prior, np.full((1, 512), 1 / 512), np.array([[0.4]]), 100.0)
+    assert weights.sum() == pytest.approx(1.0)
+    assert 100.0 <= 1.0 / (weights**2).sum() < 105.0
+
+
+def test_the_belief_is_weighted():
+    belief = Belief(np.array([[1.0, 0, 0], [3.0, 0, 0]]), np.array([[2.0], [6.0]]), np.array([0.75, 0.25]))
+    assert belief.mean[0][0] == 1.5
+    assert belief.mean[1][0] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "controller", "least"),
+    [
+        (AlphaBetaFilter, ObservedRule, 0.75),
+        (KalmanFilter, ObservedRule, 0.75),
+        (ParticleFilter, ObservedRule, 0.9),
+        (EnsembleKalmanFilter, ObservedRule, 0.9),
+        (EnsembleKalmanFilter, ObservedRollout, 0.9),
+    ],
+)
+def test_a_belt_that_is_seen_by_its_position_alone_is_suppressed(kind, controller, least):
+    starts = evaluation.VALIDATION_SEEDS[60:72]
+    policy = controller.from_env(make(**BLIND), kind.from_env(make(**BLIND)))
+    table = evaluation.evaluate(policy, RANDOMISED, starts, BLIND)
+    assert table["suppressed"].mean() >= least
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: ParticleFilter.from_env(make(), particles=4), r"particles must be .* got 4"),
+        (lambda: ParticleFilter.from_env(make(), jitter=2.0), r"jitter must be .* got 2.0"),
+        (lambda: ParticleFilter.from_env(make(), seed=-1), r"seed must be .* got -1"),
+        (lambda: KalmanFilter.from_env(make(), inflation=0.5), r"inflation must be .* got 0.5"),
+        (lambda: KalmanFilter.from_env(make(), noise=0.0), r"noise must be .* got 0.0"),
+        (lambda: AlphaBetaFilter.from_env(make(), x_gain=float("nan")), r"x_gain must be .* got nan"),
+        (lambda: Ensemble(make().nominal, make().task, ("force_amplitude",)), "cannot differ in 'force_amplitude'"),
+        (
+            lambda: ObservedRule.from_env(
+                make("SDFriction/ForceSensed-v0"), KalmanFilter.from_env(make("SDFriction/ForceSensed-v0"))
+            ),
+            "needs the actuator 'belt_speed', got 'force'",
+        ),
+        (
+            lambda: ObservedRollout.from_env(make(), KalmanFilter.from_env(make()), guesses=0),
+            r"guesses must be .* got 0",
+        ),
+        (lambda: small(KalmanFilter, make()).correct(np.zeros(2)), "at least 3 entries"),
+        (
+            lambda: small(ParticleFilter, make()).correct(
+                np.zeros((2, 3)), small(ParticleFilter, make()).correct(np.zeros(3))[1]
+            ),
+            "as many observations",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+def test_an_observer_needs_one_of_our_environments():
+    with pytest.raises(TypeError, match="must be an SDFrictionEnv"):
+        ParticleFilter.from_env(gym.make("CartPole-v1"))

@@ -48,6 +48,8 @@ def train(name: str, algorithm: str, seed: int) -> str:
     task, _, tier = name.partition("-")
     command = ["--task", task, "--tier", tier, "--algo", algorithm, "--seed", str(seed), "--no-progress"]
     command += ["--run-folder", str(folder.relative_to(ROOT))]
+    if algorithm == "ppo":  # the class that the stored runs were trained with
+        command += ["--implementation", "stable-baselines3"]
     if runs.partial_folder(folder).is_dir():
         command += ["--resume"]
     run = subprocess.run(

@@ -1,13 +1,13 @@
 """Controllers that act on what an observer believes: the rule, its look-ahead, and trained networks."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.control.observers import Belief, Observer
-from sd_friction_env.control.policies import Actions, Policy, Readings, State, ThresholdFollower
+from sd_friction_env.control.policies import Actions, Policy, State, ThresholdFollower
 from sd_friction_env.physics.parameters import checked_count
 
 _Floats = NDArray[np.float64]
@@ -59,10 +59,7 @@ class ObservedRule(ObservedPolicy):
         Raises:
             ValueError: if the actuator is not the belt's speed or has no authority.
         """
-        readings = replace(Readings.from_env(env), sees_velocity=True)
-        bare = env.unwrapped
-        speeds = {"belt_speed": bare.nominal.belt_speed, "belt_authority": bare.task.belt_authority}
-        return cls(observer, ThresholdFollower(readings=readings, **speeds), **named)
+        return cls(observer, ThresholdFollower.seeing_all(env), **named)
 
     def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
         states, parameters = belief.mean

@@ -10,10 +10,12 @@ import gymnasium as gym
 import numpy as np
 
 from sd_friction_env.control.policies.network import NetworkPolicy, PolicyFileError, load_policy
+from sd_friction_env.control.policies.recurrent import RecurrentFollower
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.storage import AGENTS
 
 PRETRAINED = AGENTS / "best"
+RECURRENT = AGENTS / "recurrent"
 
 _GOLDEN_STEPS = 60
 # Rounding on other builds may change the last digit of an observation in single precision (2e-7); a friction
@@ -29,6 +31,24 @@ def bare_id(env_id: str) -> str:
 def pretrained_file(env_id: str) -> Path:
     """Return the path of an environment's agent: "SDFriction/Force-v0" is in "SDFriction-Force-v0.npz"."""
     return PRETRAINED / f"{bare_id(env_id).replace('/', '-')}.npz"
+
+
+def recurrent_file(env_id: str) -> Path:
+    """Return the path of an open tier's recurrent follower."""
+    return RECURRENT / f"{bare_id(env_id).replace('/', '-')}.npz"
+
+
+def recurrent_follower(env: Any) -> RecurrentFollower:
+    """Return the package's recurrent follower for an environment of an open tier; it needs only NumPy.
+
+    Raises:
+        ValueError: if the package has none for it. PolicyFileError: if the file is damaged.
+    """
+    env_id = bare_id(env.unwrapped.spec.id) if getattr(env.unwrapped, "spec", None) else ""
+    if not env_id or not recurrent_file(env_id).exists():
+        known = sorted(path.stem.replace("-", "/", 1) for path in RECURRENT.glob("*.npz"))
+        raise ValueError(f"a recurrent follower was trained for {', '.join(known)}, got {env_id or env!r}")
+    return RecurrentFollower.load(recurrent_file(env_id), env)
 
 
 def fingerprint(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from sd_friction_env.control.policies import (
     rollout_follower,
     threshold_follower,
 )
-from sd_friction_env.control.pretrained import load_pretrained
+from sd_friction_env.control.pretrained import load_pretrained, recurrent_follower
 from sd_friction_env.environments.ids import environment_id
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.optimal import OptimalPolicy
@@ -56,6 +56,7 @@ MADE_FROM_ENV: dict[str, Callable[[Any], Policy]] = {
     "value-lookahead": OptimalPolicy.from_env,
     "sampling-mpc": SamplingPolicy.from_env,
     "gradient-mpc": GradientPolicy.from_env,
+    "recurrent-rule": recurrent_follower,
     **{
         f"{observer}-{controller}": functools.partial(_observed, observer, controller)
         for observer in _OBSERVERS

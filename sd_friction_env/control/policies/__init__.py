@@ -30,6 +30,7 @@ from sd_friction_env.control.policies.lookahead import LookAhead, Model, Rollout
 from sd_friction_env.control.policies.network import NetworkPolicy, PolicyFileError, load_policy
 from sd_friction_env.control.policies.planning import GradientPolicy, SamplingPolicy
 from sd_friction_env.control.policies.policy import Actions, ConstantPolicy, Policy, State, ZeroPolicy
+from sd_friction_env.control.policies.recurrent import RecurrentFollower
 
 __all__ = [
     "Actions",
@@ -48,6 +49,7 @@ __all__ = [
     "Policy",
     "PolicyFileError",
     "Readings",
+    "RecurrentFollower",
     "RolloutPolicy",
     "SamplingPolicy",
     "ScheduledFeedback",

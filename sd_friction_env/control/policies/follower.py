@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env.control.policies.feedback import Feedback
+from sd_friction_env.control.policies.feedback import Feedback, Readings
 from sd_friction_env.control.policies.lookahead import Model, RolloutPolicy
 from sd_friction_env.control.policies.policy import State, broadcast_starts, checked_memory, remembered
 
@@ -65,6 +65,11 @@ class ThresholdFollower(Feedback):
         if hasattr(bare, "task") and hasattr(bare, "nominal"):
             named = cls._known(bare) | named
         return super().from_env(env, *arguments, **named)
+
+    @classmethod
+    def seeing_all(cls, env: Any) -> Self:
+        """Return the controller of an environment for a state that is known otherwise than by its sensor."""
+        return cls(readings=replace(Readings.from_env(env), sees_velocity=True), **cls._known(env.unwrapped))
 
     @classmethod
     def _known(cls, env: Any) -> dict[str, Any]:
@@ -246,6 +251,5 @@ def rollout_follower(env: Any) -> Feedback:
     follower = threshold_follower(env)
     if not isinstance(follower, ObservingFollower):
         return RolloutPolicy.from_env(env, ThresholdFollower.from_env(env))
-    readings = replace(follower.readings, sees_velocity=True)
-    rule = ThresholdFollower(readings=readings, belt_speed=follower.belt_speed, belt_authority=follower.belt_authority)
-    return replace(follower, rollout=RolloutPolicy(rule, readings=readings, model=follower.model))
+    rule = ThresholdFollower.seeing_all(env)
+    return replace(follower, rollout=RolloutPolicy(rule, readings=rule.readings, model=follower.model))

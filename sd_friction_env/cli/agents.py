@@ -61,9 +61,9 @@ def velocity_feedback(env_id: str, env_kwargs: dict[str, Any], gain: float | Non
     return VelocityFeedback.from_env(env, used), used
 
 
-def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
-    """Return the controller that --agent names: one of ``NAMED`` ("classical": the best of the tuned ones), a run
-    folder, a .npz or .onnx file, or module:NAME as :func:`imported_policy` takes it.
+def agent_of(name: str, env_id: str, *, gain: float | None = None, env_kwargs: dict[str, Any] | None = None) -> Policy:
+    """Return the controller of an environment that --agent names: one of ``NAMED`` ("classical": the best tuned one), a
+    run folder, a .npz or .onnx file, or module:NAME as :func:`imported_policy` takes it.
 
     Raises:
         ValueError: if there is no such agent, or it does not fit the environment.
@@ -77,20 +77,20 @@ def agent_of(name: str, env_id: str, *, gain: float | None = None) -> Policy:
     if name == "classical":
         return classical.best_controller(env_id)[1]
     if name == "velocity-feedback":
-        return velocity_feedback(env_id, {}, gain)[0]
+        return velocity_feedback(env_id, env_kwargs or {}, gain)[0]
     if name in MADE_FROM_ENV:
-        return MADE_FROM_ENV[name](evaluation.make_env(env_id))
+        return MADE_FROM_ENV[name](evaluation.make_env(env_id, env_kwargs))
     path = Path(name)
     if path.suffix.lower() == ".onnx":
         with extra("export"):
             from sd_friction_env.learning import export
-        return export.ExportedPolicy.load(path, evaluation.make_env(env_id))
+        return export.ExportedPolicy.load(path, evaluation.make_env(env_id, env_kwargs))
     if ":" in name and not path.exists():
-        return imported_policy(name, evaluation.make_env(env_id))
+        return imported_policy(name, evaluation.make_env(env_id, env_kwargs))
     if path.suffix.lower() != ".npz" and not path.is_dir():
         raise UsageError(f"the agent must be {AGENTS_TEXT}, got {name!r}")
     policy, _ = stored_agent(path)
-    check_fit(path, policy, env_id, {})
+    check_fit(path, policy, env_id, env_kwargs or {})
     return policy
 
 

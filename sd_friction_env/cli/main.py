@@ -41,6 +41,7 @@ _COMMANDS = {
     "report": ("report", "report", "every controller on every task: tables, pictures, one HTML page"),
     "explore": ("play", "explore", "the oscillator live in the browser, with sliders and controllers"),
     "video": ("play", "video", "a video of an episode, without control and with it side by side"),
+    "listen": ("play", "train", "the squeal as sound, without control and then under control"),
     "hyperparameters": ("setup", "train", "where the tuned hyperparameters are, in RL Zoo's format"),
     "doctor": ("setup", "", "versions, caches, threads, and what is missing for which feature"),
     "completion": ("setup", "completion", "a script that makes a shell complete commands and options"),

@@ -1,17 +1,27 @@
-"""To look at and to play with: ``sd-friction explore`` and ``sd-friction video``."""
+"""To look at, to listen to and to play with: ``sd-friction explore``, ``video`` and ``listen``."""
 
 import argparse
+import math
 from pathlib import Path
+
+import numpy as np
 
 from sd_friction_env.cli.agents import AGENTS_TEXT, agent_of, title_of
 from sd_friction_env.cli.options import (
     Command,
     UsageError,
     add_environment,
+    add_oscillator,
     check_at_least,
+    check_file,
     environment_of,
+    one_of,
     progress_bar,
 )
+from sd_friction_env.control import sound
+from sd_friction_env.environments.ids import TASKS, environment_id
+from sd_friction_env.learning import evaluation
+from sd_friction_env.physics import signals
 from sd_friction_env.pictures.renderer import checked_size
 
 
@@ -94,6 +104,44 @@ def _add_video(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--alone", action="store_true", help="without the passive oscillator beside it")
 
 
+LISTEN_TEXT = """\
+Writes the velocity of the mass as sound: the passive limit cycle, then the same motion under control. An oscillator of
+a rig (--rig) is played at its own frequency if that is audible, any other at 440 Hz, or at --pitch."""
+
+
+def _add_listen(parser: argparse.ArgumentParser) -> None:
+    add_oscillator(parser)
+    parser.add_argument("--task", choices=TASKS, default="belt", help="actuator (default: belt)")
+    text = f"{AGENTS_TEXT} (default: threshold-follower by the belt, velocity-feedback by force)"
+    parser.add_argument("--agent", metavar="AGENT", help=text)
+    parser.add_argument("--gain", type=float, help="of velocity-feedback (default: 1.5 on force, 1 on belt)")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.wav", help="file to write")
+    parser.add_argument("--pitch", type=float, metavar="HZ", help="frequency of the squeal in the sound")
+    parser.add_argument("--seconds", type=float, default=1.0, help="of each part (default: 1)")
+    parser.add_argument("--rate", type=int, default=44_100, help="samples a second (default: 44100)")
+
+
+def _listen(options: argparse.Namespace) -> int:
+    check_file("--out", options.out, ".wav")
+    parameters = one_of(options)
+    pitch = sound.pitch_of(parameters, options.pitch)
+    env_id = environment_id(options.task)
+    steps = 2 + math.ceil(options.seconds / pitch.unit / evaluation.make_env(env_id).task.control_interval)
+    env_kwargs = {"parameters": parameters, "episode_steps": max(steps, 1)}
+    name = options.agent or ("threshold-follower" if options.task == "belt" else "velocity-feedback")
+    policy = agent_of(name, env_id, gain=options.gain, env_kwargs=env_kwargs)
+    env = evaluation.make_env(env_id, env_kwargs)
+    before, after = sound.squeal(env, policy, pitch, seconds=options.seconds, rate=options.rate)
+    sound.write_sound(options.out, np.concatenate([before, after]), options.rate)
+    heard = signals.harmonics(before, 1.0 / options.rate, count=1)["frequency"][0]
+    own = "" if math.isnan(pitch.own) else f", on the rig {pitch.own:.6g} Hz"
+    print(f"one dimensionless unit of time is {pitch.unit:.6g} s of sound{own}")
+    print(f"fundamental in the sound {heard:.4f} Hz, 1/T of the limit cycle {pitch.played:.4f} Hz")
+    loud, quiet = (float(np.std(part[len(part) // 2 :])) for part in (before, after))
+    print(f"level under control, last half: {20.0 * math.log10(max(quiet, 1e-300) / loud):.1f} dB of the squeal's")
+    return 0
+
+
 COMMANDS = {
     "explore": Command(
         _add_explore,
@@ -108,5 +156,15 @@ COMMANDS = {
             "--task force --agent velocity-feedback --gain 1.5 --size 480 270 --every 3 --fps 10 --out small.gif",
             "--task belt --tier sensed --agent runs/mine --seed 3 --alone --out mine.mp4",
         ],
+    ),
+    "listen": Command(
+        _add_listen,
+        _listen,
+        [
+            "--out squeal.wav",
+            "--task force --belt-speed 0.1 --pitch 880 --out high.wav",
+            "--rig rig.toml --out rig.wav",
+        ],
+        LISTEN_TEXT,
     ),
 }

@@ -6,18 +6,21 @@ Where it changes, v_rel = 0 is met at the border of the stick cone: a sliding bi
 vanishes there and its neighbours say (di Bernardo, Kowalczyk and Nordmark, 2003, Int. J. Bifurcation and Chaos 13).
 """
 
+import contextlib
 import dataclasses
+import itertools
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sd_friction_env import kernel
-from sd_friction_env.physics.continuation import BranchEndError, FloatArray, Point, correct, follow
+from sd_friction_env.physics.continuation import BranchEndError, FloatArray, Point, correct, follow, solution_at
 from sd_friction_env.physics.forced.orbits import ForcedOrbit, orbit_at
 from sd_friction_env.physics.forced.sections import Stroboscope, active_excitations, at_phase
 from sd_friction_env.physics.orbits import OrbitError
 from sd_friction_env.physics.parameters import (
+    RANGES,
     STATE_LIMIT,
     OscillatorParameters,
     brief_repr,
@@ -31,7 +34,11 @@ _MOST_PIECES = 200  # of a branch, between changes of the sequence of arcs
 _AHEAD = (1e-5, 3e-5, 1e-4, 1e-3)  # in longest steps: where a change of the sequence is looked for
 _LOCATED = 1e-14  # in scaled arc length
 _SHORTEST_SLIP = 1e-3  # half of the longest slip in an orbit, as a share of its duration
+_JUMP = 1e-3  # residual at a test function's change of sign that is no zero of it
+_SAME = 1e-7  # distance of section points of one orbit
+_CLOSED = "the curve is closed"
 _NEAR = "an event nears the section"
+_MISSED = 1e-6  # by more than this a sliding bifurcation's condition is not met: the map jumps
 _FLIP = 1e-4  # distance from -1 of the multiplier of an orbit that is doubled
 _LETTERS = {kernel.SLIP_BACKWARD: "b", kernel.STICK: "s", kernel.SLIP_FORWARD: "f"}
 
@@ -52,23 +59,22 @@ class OrbitProblem:
     Args:
         orbit: at which it starts.
         name: of the parameter.
-        width: of its range, the unit of its scale.
+        limits: of the parameter; their distance is the unit of its scale.
         share: of the section, in the orbit's duration from t = 0.
     """
 
-    def __init__(self, orbit: ForcedOrbit, name: str, width: float, share: float) -> None:
-        self.orbit, self.name, self.share = orbit, name, share
-        self.scale = np.array([1.0, 1.0, width])
-        self.shift = at_phase(orbit.parameters, share * orbit.period)
+    def __init__(self, orbit: ForcedOrbit, name: str, limits: tuple[float, float], share: float) -> None:
+        self.orbit, self.name, self.limits, self.share = orbit, name, limits, share
+        self.scale = np.array([1.0, 1.0, limits[1] - limits[0]])
         self.rates = [f"{kind}_frequency" for kind in active_excitations(orbit.parameters)]
         self.modes: str | None = None  # to which the curve is kept
         self.margin = 0.0  # from the section to the next event, as a share of the duration: kept
         self._seen: tuple[FloatArray, FloatArray] | None = None
 
     def oscillator(self, y: FloatArray) -> OscillatorParameters:
-        """Return the oscillator at y; BranchEndError if its parameters are not valid."""
+        """Return the oscillator at y, or at the limit that it passes; BranchEndError if it is not valid."""
         try:
-            return self.orbit.parameters.replace(**{self.name: float(y[2])})
+            return self.orbit.parameters.replace(**{self.name: float(np.clip(y[2], *self.limits))})
         except ValueError as error:
             raise BranchEndError(str(error)) from None
 
@@ -76,7 +82,7 @@ class OrbitProblem:
         """Return the orbit's duration."""
         if self.name not in self.rates:
             return self.orbit.period
-        return self.orbit.period * float(getattr(self.orbit.parameters, self.name) / y[2])
+        return self.orbit.period * float(getattr(self.orbit.parameters, self.name) / np.clip(y[2], *self.limits))
 
     def _shifted(self, y: FloatArray) -> OscillatorParameters:
         return at_phase(self.oscillator(y), self.share * self.duration(y))
@@ -94,9 +100,11 @@ class OrbitProblem:
         return motion
 
     def residual(self, y: FloatArray) -> FloatArray:
-        """Return where a lap ends minus where it begins."""
+        """Return where a lap ends minus where it begins; past a limit of the parameter, extended along a line."""
+        past = float(y[2] - np.clip(y[2], *self.limits))
         motion = self._lap(y, np.empty((kernel.TANGENT_ROWS, 0)), None)
-        return np.array([motion.x - y[0], motion.v - y[1]])
+        missed = np.array([motion.x - y[0], motion.v - y[1]])
+        return missed + past * self.jacobian(y)[:, 2] if past else missed
 
     def jacobian(self, y: FloatArray) -> FloatArray:
         """Return its derivatives; BranchEndError where the arcs are not those kept or one ends near the section."""
@@ -117,7 +125,9 @@ class OrbitProblem:
         matrix = tangents[:2].copy()
         if self.name in self.rates:
             duration = self.duration(y)
-            matrix[:, 2] -= duration / y[2] * np.array([motion.v, self._acceleration(y, motion, duration)])
+            matrix[:, 2] -= (
+                duration / np.clip(y[2], *self.limits) * np.array([motion.v, self._acceleration(y, motion, duration)])
+            )
         self._seen = y.copy(), matrix - np.eye(2, 3)
         return self._seen[1]
 
@@ -183,7 +193,7 @@ class OrbitProblem:
 
         begin = there(y)
         small = 1e-7 * self.scale * along
-        problem = OrbitProblem(self.orbit, self.name, float(self.scale[2]), (self.share + share) % 1.0)
+        problem = OrbitProblem(self.orbit, self.name, self.limits, (self.share + share) % 1.0)
         problem.margin = 0.25 * half
         return problem, begin, (there(y + small) - begin) / (1e-7 * self.scale)
 
@@ -213,7 +223,7 @@ class OrbitBranch(NamedTuple):
     Columns: kind, the parameter, x and v (at the section of the first orbit), amplitude, x_min, x_max, period,
     stick_fraction, sequence (of arcs in a period: b, s, f), stable, multiplier and multiplier_imag (of the greatest
     modulus), second_multiplier, residual (of the equations that the point solves), condition (by how much a sliding
-    bifurcation's condition is missed, in force or speed), reason (of an end: why).
+    bifurcation's condition is missed, in force or speed; nan where the map jumps there, as with mu_k < mu_s), reason (of an end: why).
     """
 
     table: Table
@@ -255,10 +265,12 @@ def follow_orbit(start: ForcedOrbit, over: tuple[str, float, float], *, points: 
     points = checked_count("points", points, 10, 10_000)
     y, upwards = np.array([start.x, start.v, value]), np.array([0.0, 0.0, 1.0])
     try:
-        at_start = OrbitProblem(start, name, high - low, start.phase / start.multiple)
+        at_start = OrbitProblem(start, name, (low, high), start.phase / start.multiple)
         problem, y, _ = at_start.moved(y, upwards)
         y = correct(problem, y, upwards)
-        back, forth = (_one_way(problem, y, way * upwards, low, high, 1.0 / points) for way in (-1.0, 1.0))
+        back, forth = [], _one_way(problem, y, upwards, 1.0 / points)
+        if forth[-1].reason != _CLOSED:
+            back = _one_way(problem, y, -upwards, 1.0 / points)
     except BranchEndError as error:
         raise OrbitError(f"no orbit to start from: {error}; {p}") from None
     places = [*reversed(back[1:]), *forth]
@@ -297,12 +309,10 @@ def _row(name: str, place: Place, orbit: ForcedOrbit) -> dict[str, Any]:
     }
 
 
-def _one_way(
-    problem: OrbitProblem, y: FloatArray, along: FloatArray, low: float, high: float, longest: float
-) -> list[Place]:
+def _one_way(problem: OrbitProblem, y: FloatArray, along: FloatArray, longest: float) -> list[Place]:
     """Return the places of a branch from a solution on, piece by piece with one sequence of arcs each."""
     places: list[Place] = []
-    reason = f"left after {_MOST_PIECES} changes of the sequence of slips and sticks"
+    value, left = y[2], f"left after {_MOST_PIECES} changes of the section or of the sequence of slips and sticks"
     for piece in range(_MOST_PIECES):
         problem.modes = problem.sequence(y)
         branch = follow(
@@ -310,13 +320,16 @@ def _one_way(
             y,
             along,
             longest=longest,
-            limits={2: (low, high, problem.name)},
+            limits={2: (*problem.limits, problem.name)},
             tests=_tests(problem),
         )
-        found = [_named(problem, point) for point in branch.points[1 if piece else 0 :]]
+        found = [_named(problem, point) for point in branch.points[1 if piece else 0 :] if point.residual < _JUMP]
         places += [Place(problem, point, problem.modes) for point in found]
         last, reason = branch.points[-1], branch.reason
-        if reason.startswith((problem.name, "the curve is closed", "left")):
+        closing = _closing(problem, branch.points, value) if piece else None
+        if closing is not None:
+            places, reason = places[: len(places) - len(found) + closing], _CLOSED
+        if reason.startswith((problem.name, _CLOSED, "left")):
             break
         near = reason == _NEAR
         change = None if near else _change(problem, last, longest)
@@ -332,9 +345,22 @@ def _one_way(
         except BranchEndError as error:
             reason = str(error)
             break
+    else:
+        reason = left
     end = places[-1].point
     places[-1] = places[-1]._replace(reason=reason, point=end._replace(kind="end") if end.kind == "point" else end)
     return places
+
+
+def _closing(problem: OrbitProblem, points: list[Point], value: float) -> int | None:
+    """Return how many of the points come before the branch passes the orbit that it began with, or None."""
+    for i, (before, after) in enumerate(itertools.pairwise(point.y for point in points)):
+        if (before[2] - value) * (after[2] - value) <= 0.0:
+            with contextlib.suppress(BranchEndError):
+                there = problem.orbit_of(solution_at(problem, before, after, 2, value))
+                if np.abs(problem.orbit.points - (there.x, there.v)).max(axis=1).min() < _SAME:
+                    return i
+    return None
 
 
 def _tests(problem: OrbitProblem) -> dict[str, Any]:
@@ -395,6 +421,7 @@ def _change(problem: OrbitProblem, last: Point, longest: float) -> Place | None:
     longer = beyond if len(after) > len(kept) else best
     kind, condition = sliding_kind(problem.arcs(longer)) if len(after) != len(kept) else ("other", math.nan)
     residual = float(np.abs(problem.residual(best)).max())
+    condition = condition if condition < _MISSED else math.nan
     return Place(problem, Point(best, last.tangent, residual, {}, kind), kept, condition)
 
 
@@ -432,9 +459,10 @@ def _beyond(problem: OrbitProblem, place: Point, longest: float) -> tuple[OrbitP
             try:
                 matrix = problem.jacobian(place.y + problem.scale * step * place.tangent)
                 direction = np.linalg.svd(matrix * problem.scale)[2][-1]
-                direction *= math.copysign(way, direction @ place.tangent)
+                direction *= way * math.copysign(1.0, direction @ place.tangent)
                 y = correct(problem, place.y + problem.scale * step * direction, direction)
-                if problem.sequence(y) != kept:
+                apart = float(np.linalg.norm((y - place.y) / problem.scale))
+                if apart < 10.0 * step and problem.sequence(y) != kept:
                     return problem.moved(y, direction)
             except BranchEndError:
                 continue
@@ -457,18 +485,19 @@ def doubled_orbit(orbit: ForcedOrbit, name: str, *, step: float = 1e-3) -> Force
     p = orbit.parameters
     _check_use(p, name)
     value = p.values[name]
+    low, high = RANGES.get(name, (-1e12, 1e12))
+    width = max(abs(value), 1e-3)
+    limits = max(low, value - 0.5 * width), min(high, value + 0.5 * width)
     try:
         y = np.array([orbit.x, orbit.v, value])
-        problem, y, _ = OrbitProblem(orbit, name, max(abs(value), 1e-3), orbit.phase / orbit.multiple).moved(
-            y, np.zeros(3)
-        )
+        problem, y, _ = OrbitProblem(orbit, name, limits, orbit.phase / orbit.multiple).moved(y, np.zeros(3))
         values, vectors = np.linalg.eig(problem.map(y))
         i = int(np.argmin(np.abs(values + 1.0)))
         if abs(values[i] + 1.0) > _FLIP:
             raise ValueError(f"orbit must be at a flip (a multiplier -1), its multipliers are {orbit.multipliers}")
         direction = np.append(np.real(vectors[:, i]), 0.0)
         longer = dataclasses.replace(orbit, multiple=2 * orbit.multiple, period=2.0 * orbit.period)
-        twice = OrbitProblem(longer, name, float(problem.scale[2]), 0.5 * problem.share)
+        twice = OrbitProblem(longer, name, problem.limits, 0.5 * problem.share)
         return twice.orbit_of(correct(twice, y + step * direction, direction))
     except BranchEndError as error:
         raise OrbitError(f"no orbit of twice the period: {error}; {p}") from None

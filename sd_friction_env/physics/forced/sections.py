@@ -102,7 +102,7 @@ def at_phase(parameters: OscillatorParameters, time: float) -> OscillatorParamet
         f"{kind}_phase": math.remainder(
             getattr(parameters, f"{kind}_phase") + time * getattr(parameters, f"{kind}_frequency"), 2.0 * math.pi
         )
-        for kind in active_excitations(parameters)
+        for kind in EXCITATIONS
     }
     return parameters.replace(**phases)
 

@@ -43,6 +43,16 @@ _FLIP = 1e-4  # distance from -1 of the multiplier of an orbit that is doubled
 _LETTERS = {kernel.SLIP_BACKWARD: "b", kernel.STICK: "s", kernel.SLIP_FORWARD: "f"}
 
 
+# The leading order in which the maps on both sides of a sliding bifurcation differ, and what comes next (di Bernardo,
+# Kowalczyk and Nordmark, 2002, Physica D 170).
+LOCAL_MAPS = {
+    "grazing-sliding": (1.0, "linear on each side, 3/2 next"),
+    "crossing-sliding": (2.0, "quadratic"),
+    "adding-sliding": (2.0, "quadratic, 5/2 next"),
+    "switching-sliding": (3.0, "cubic"),
+}
+
+
 class Arc(NamedTuple):
     """A slip or a stick of an orbit: its mode, when it begins and ends, and the excess over the stick cone there."""
 
@@ -223,7 +233,8 @@ class OrbitBranch(NamedTuple):
     Columns: kind, the parameter, x and v (at the section of the first orbit), amplitude, x_min, x_max, period,
     stick_fraction, sequence (of arcs in a period: b, s, f), stable, multiplier and multiplier_imag (of the greatest
     modulus), second_multiplier, residual (of the equations that the point solves), condition (by how much a sliding
-    bifurcation's condition is missed, in force or speed; nan where the map jumps there, as with mu_k < mu_s), reason (of an end: why).
+    bifurcation's condition is missed, in force or speed; nan where the map jumps, as with mu_k < mu_s), reason (of an
+    end: why).
     """
 
     table: Table

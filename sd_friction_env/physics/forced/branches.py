@@ -183,7 +183,7 @@ class OrbitProblem:
         return found
 
     def sequence(self, y: FloatArray) -> str:
-        """Return :func:`sequence` of a lap."""
+        """Return the letters of a lap's arcs."""
         return sequence(self.arcs(y))
 
     def moved(self, y: FloatArray, along: FloatArray) -> tuple["OrbitProblem", FloatArray, FloatArray]:
@@ -282,10 +282,10 @@ def follow_orbit(start: ForcedOrbit, over: tuple[str, float, float], *, points: 
         back, forth = [], _one_way(problem, y, upwards, 1.0 / points)
         if forth[-1].reason != _CLOSED:
             back = _one_way(problem, y, -upwards, 1.0 / points)
+        places = [*reversed(back[1:]), *forth]
+        orbits = tuple(place.problem.orbit_of(place.point.y) for place in places)
     except BranchEndError as error:
-        raise OrbitError(f"no orbit to start from: {error}; {p}") from None
-    places = [*reversed(back[1:]), *forth]
-    orbits = tuple(place.problem.orbit_of(place.point.y) for place in places)
+        raise OrbitError(f"the orbit cannot be followed: {error}; {p}") from None
     rows = [_row(name, place, orbit) for place, orbit in zip(places, orbits, strict=True)]
     metadata = {"over": name, "range": [low, high], "multiple": start.multiple, "points": points}
     return OrbitBranch(Table({column: np.array([row[column] for row in rows]) for column in rows[0]}, metadata), orbits)

@@ -189,6 +189,18 @@ def test_a_cut_stick_changes_the_map_in_second_order():
     assert order_of_map(orbit, "force_frequency") == pytest.approx(LOCAL_MAPS["adding-sliding"][0], abs=0.2)
 
 
+@pytest.mark.parametrize("name", ["force_frequency", "force_amplitude", "force_phase", "belt_speed", "mu_s", "alpha"])
+def test_the_derivatives_of_the_map_are_what_differences_say(name):
+    p = STRIBECK.replace(force_phase=0.3)
+    orbit, value = forced_orbit(p), p.values[name]
+    problem = OrbitProblem(orbit, name, (value - 0.1, value + 0.1), 0.0)
+    problem, y, _ = problem.moved(np.array([orbit.x, orbit.v, value]), np.zeros(3))
+    h = 1e-6
+    for column, row in enumerate(np.eye(3)):
+        slope = (problem.residual(y + h * row) - problem.residual(y - h * row)) / (2.0 * h)
+        assert problem.jacobian(y)[:, column] == pytest.approx(slope, abs=1e-6)
+
+
 def test_every_orbit_closes_and_the_branch_is_continuous(stribeck):
     for orbit in stribeck.orbits[::10]:
         path = orbit.trajectory(200)

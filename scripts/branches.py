@@ -87,11 +87,11 @@ def plot(path: str, branches: list[OrbitBranch]) -> None:
     figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
     axes.plot(diagram["value"], diagram["x"], ",", color="0.6")
     for branch in branches:
-        for stable, style in ((True, {"marker": ".", "color": "C0"}), (False, {"marker": ".", "color": "C3"})):
+        for stable, color in ((True, "C0"), (False, "C3")):
             chosen = [i for i, orbit in enumerate(branch.orbits) if orbit.stable == stable]
             for n in range(branch.orbits[0].multiple):
                 x = [branch.orbits[i].points[n, 0] for i in chosen]
-                axes.plot(branch.table[name][chosen], x, linestyle="", markersize=2, **style)
+                axes.plot(branch.table[name][chosen], x, ".", color=color, markersize=2)
     axes.set(xlabel=name, ylabel="x at the section", title="stable orbits blue, unstable red, sweeps grey")
     figure.savefig(path, dpi=80)
 

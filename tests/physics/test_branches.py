@@ -249,6 +249,14 @@ def test_where_the_map_jumps_the_branch_ends_with_a_reason():
     assert math.isnan(last["condition"])
 
 
+def test_a_branch_that_ends_where_it_starts_says_why():
+    branch = follow_orbit(forced_orbit(COULOMB.replace(force_frequency=1.3, force_amplitude=0.3)), ("mu_s", 0.1, 0.25))
+    first = next(branch.table.rows())
+    assert first["mu_s"] == 0.2
+    assert first["reason"].startswith("mu_k must not exceed mu_s")
+    assert branch.table["reason"][-1] == "mu_s reaches 0.25"
+
+
 def test_wrong_arguments_are_named():
     orbit = forced_orbit(COULOMB)
     with pytest.raises(TypeError, match="start must be a ForcedOrbit"):

@@ -34,6 +34,7 @@ _MOST_PIECES = 200  # of a branch, between changes of the sequence of arcs
 _AHEAD = (1e-5, 3e-5, 1e-4, 1e-3)  # in longest steps: where a change of the sequence is looked for
 _LOCATED = 1e-14  # in scaled arc length
 _SHORTEST_SLIP = 1e-3  # half of the longest slip in an orbit, as a share of its duration
+_ROUNDING = 1e-12  # of a parameter, in its range
 _JUMP = 1e-3  # residual at a test function's change of sign that is no zero of it
 _SAME = 1e-7  # distance of section points of one orbit
 _CLOSED = "the curve is closed"
@@ -81,10 +82,15 @@ class OrbitProblem:
         self.margin = 0.0  # from the section to the next event, as a share of the duration: kept
         self._seen: tuple[FloatArray, FloatArray] | None = None
 
+    def value(self, y: FloatArray) -> float:
+        """Return the parameter at y: at most its limits, and where y is the start up to rounding the start's."""
+        first = float(self.orbit.parameters.values[self.name])
+        return first if abs(y[2] - first) < _ROUNDING * self.scale[2] else float(np.clip(y[2], *self.limits))
+
     def oscillator(self, y: FloatArray) -> OscillatorParameters:
         """Return the oscillator at y, or at the limit that it passes; BranchEndError if it is not valid."""
         try:
-            return self.orbit.parameters.replace(**{self.name: float(np.clip(y[2], *self.limits))})
+            return self.orbit.parameters.replace(**{self.name: self.value(y)})
         except ValueError as error:
             raise BranchEndError(str(error)) from None
 
@@ -92,7 +98,7 @@ class OrbitProblem:
         """Return the orbit's duration."""
         if self.name not in self.rates:
             return self.orbit.period
-        return self.orbit.period * float(getattr(self.orbit.parameters, self.name) / np.clip(y[2], *self.limits))
+        return self.orbit.period * float(getattr(self.orbit.parameters, self.name) / self.value(y))
 
     def _shifted(self, y: FloatArray) -> OscillatorParameters:
         return at_phase(self.oscillator(y), self.share * self.duration(y))
@@ -111,7 +117,7 @@ class OrbitProblem:
 
     def residual(self, y: FloatArray) -> FloatArray:
         """Return where a lap ends minus where it begins; past a limit of the parameter, extended along a line."""
-        past = float(y[2] - np.clip(y[2], *self.limits))
+        past = 0.0 if self.limits[0] <= y[2] <= self.limits[1] else float(y[2]) - self.value(y)
         motion = self._lap(y, np.empty((kernel.TANGENT_ROWS, 0)), None)
         missed = np.array([motion.x - y[0], motion.v - y[1]])
         return missed + past * self.jacobian(y)[:, 2] if past else missed
@@ -135,9 +141,7 @@ class OrbitProblem:
         matrix = tangents[:2].copy()
         if self.name in self.rates:
             duration = self.duration(y)
-            matrix[:, 2] -= (
-                duration / np.clip(y[2], *self.limits) * np.array([motion.v, self._acceleration(y, motion, duration)])
-            )
+            matrix[:, 2] -= duration / self.value(y) * np.array([motion.v, self._acceleration(y, motion, duration)])
         self._seen = y.copy(), matrix - np.eye(2, 3)
         return self._seen[1]
 
@@ -282,6 +286,8 @@ def follow_orbit(start: ForcedOrbit, over: tuple[str, float, float], *, points: 
         back, forth = [], _one_way(problem, y, upwards, 1.0 / points)
         if forth[-1].reason != _CLOSED:
             back = _one_way(problem, y, -upwards, 1.0 / points)
+            if len(back) == 1:  # it ends where it starts
+                forth[0] = forth[0]._replace(reason=back[0].reason)
         places = [*reversed(back[1:]), *forth]
         orbits = tuple(place.problem.orbit_of(place.point.y) for place in places)
     except BranchEndError as error:
@@ -326,14 +332,14 @@ def _one_way(problem: OrbitProblem, y: FloatArray, along: FloatArray, longest: f
     value, left = y[2], f"left after {_MOST_PIECES} changes of the section or of the sequence of slips and sticks"
     for piece in range(_MOST_PIECES):
         problem.modes = problem.sequence(y)
-        branch = follow(
-            problem,
-            y,
-            along,
-            longest=longest,
-            limits={2: (*problem.limits, problem.name)},
-            tests=_tests(problem),
-        )
+        limits = {2: (*problem.limits, problem.name)}
+        try:
+            branch = follow(problem, y, along, longest=longest, limits=limits, tests=_tests(problem))
+        except BranchEndError as error:
+            if not places:
+                raise
+            reason = str(error)
+            break
         found = [_named(problem, point) for point in branch.points[1 if piece else 0 :] if point.residual < _JUMP]
         places += [Place(problem, point, problem.modes) for point in found]
         last, reason = branch.points[-1], branch.reason
@@ -424,7 +430,10 @@ def _change(problem: OrbitProblem, last: Point, longest: float) -> Place | None:
         low, high, best = (low, middle, best) if y is None else (middle, high, y)
     for step in np.geomspace(1e-14, 1e-4 * longest, 40).tolist():
         beyond = best + problem.scale * step * last.tangent
-        after = problem.sequence(beyond)
+        try:
+            after = problem.sequence(beyond)
+        except BranchEndError:  # the oscillator has no meaning there
+            return None
         if after != kept:
             break
     else:

@@ -33,7 +33,9 @@ def stribeck():
 def test_a_slip_grazes_the_belt_where_the_linear_response_reaches_its_speed():
     # In slip Coulomb friction is constant: x' = f W/|1 - W^2 + 2 i beta W| cos(...) reaches v_b = 0.5.
     rate = 1.3
-    branch = follow_orbit(forced_orbit(COULOMB.replace(force_frequency=rate)), ("force_amplitude", 0.05, 0.8))
+    branch = follow_orbit(
+        forced_orbit(COULOMB.replace(force_frequency=rate)), ("force_amplitude", 0.05, 0.8), points=20
+    )
     (row, orbit), *rest = of_kind(branch, "grazing-sliding")
     assert not rest
     assert row["force_amplitude"] == pytest.approx(0.5 * math.hypot(1.0 - rate**2, 0.1 * rate) / rate, abs=1e-11)
@@ -47,7 +49,7 @@ def test_motion_without_stops_ends_where_den_hartog_says(rate):
     # Den Hartog (1931), undamped: half a period of x'' + x = F + f cos(W t + phi) from rest to rest; A = F/W^2 at last.
     force = 0.2 * abs(1.0 - rate**2) * math.hypot(1.0 / rate**2, math.tan(0.5 * math.pi / rate) / rate)
     p = STANDING.replace(beta=0.0, force_frequency=rate, force_amplitude=1.4 * force)
-    branch = follow_orbit(forced_orbit(p, 1.0, transient=400), ("force_amplitude", 0.9 * force, 2.0 * force))
+    branch = follow_orbit(forced_orbit(p, 1.0, transient=400), ("force_amplitude", 0.9 * force, 2.0 * force), points=20)
     (row, orbit), *rest = of_kind(branch, "crossing-sliding")
     assert not rest
     assert row["force_amplitude"] == pytest.approx(force, abs=1e-10)
@@ -78,7 +80,9 @@ def test_a_stick_is_cut_in_two_where_its_load_touches_the_cone():
         time = brentq(lambda t: (expm(matrix * t) @ begin)[1], 1.0, 7.0, xtol=1e-14)
         return (expm(matrix * time) @ begin)[0] - at_rest
 
-    branch = follow_orbit(forced_orbit(STANDING.replace(force_frequency=0.25), 1.0), ("force_frequency", 0.16, 0.9))
+    branch = follow_orbit(
+        forced_orbit(STANDING.replace(force_frequency=0.25), 1.0), ("force_frequency", 0.16, 0.9), points=20
+    )
     (row, orbit), *rest = of_kind(branch, "adding-sliding")
     assert not rest
     assert row["force_frequency"] == pytest.approx(brentq(stop, 0.17, 0.21, xtol=1e-14), abs=1e-10)
@@ -177,13 +181,15 @@ def order_of_map(orbit, name):
 @pytest.mark.parametrize("kind", ["grazing-sliding", "switching-sliding", "crossing-sliding"])
 def test_the_maps_on_both_sides_part_in_the_order_of_theory(kind):
     p = COULOMB.replace(force_frequency=1.3)
-    (_, orbit), *_ = of_kind(follow_orbit(forced_orbit(p), ("force_amplitude", 0.05, 0.8)), kind)
+    (_, orbit), *_ = of_kind(follow_orbit(forced_orbit(p), ("force_amplitude", 0.05, 0.8), points=20), kind)
     assert order_of_map(orbit, "force_amplitude") == pytest.approx(LOCAL_MAPS[kind][0], abs=0.2)
 
 
 def test_a_cut_stick_changes_the_map_in_second_order():
     (_, orbit), *_ = of_kind(
-        follow_orbit(forced_orbit(STANDING.replace(force_frequency=0.25), 1.0), ("force_frequency", 0.16, 0.3)),
+        follow_orbit(
+            forced_orbit(STANDING.replace(force_frequency=0.25), 1.0), ("force_frequency", 0.16, 0.3), points=20
+        ),
         "adding-sliding",
     )
     assert order_of_map(orbit, "force_frequency") == pytest.approx(LOCAL_MAPS["adding-sliding"][0], abs=0.2)
@@ -242,7 +248,7 @@ def test_a_branch_of_its_own_is_followed_once_around():
 
 def test_where_the_map_jumps_the_branch_ends_with_a_reason():
     p = COULOMB.replace(mu_s=0.3, force_frequency=1.3)
-    branch = follow_orbit(forced_orbit(p), ("force_amplitude", 0.05, 0.8))
+    branch = follow_orbit(forced_orbit(p), ("force_amplitude", 0.05, 0.8), points=20)
     last = list(branch.table.rows())[-1]
     assert last["kind"] == "grazing-sliding"
     assert last["reason"] == "no orbit goes on beyond the grazing-sliding"

@@ -24,7 +24,7 @@ from sd_friction_env.physics.parameters import (
     brief_repr,
     checked_choice,
     checked_count,
-    checked_number,
+    checked_range,
 )
 from sd_friction_env.physics.tables import Table
 
@@ -107,14 +107,8 @@ def _checked(parameters: Any, over: Any, against: Any) -> tuple[str, float, floa
     if not isinstance(parameters, OscillatorParameters):
         raise TypeError(f"parameters must be OscillatorParameters, got {brief_repr(parameters)}")
     check_unexcited(parameters)
-    if not isinstance(over, tuple | list) or len(over) != 3 or not isinstance(over[0], str):
-        raise TypeError(f"over must be (name, low, high), got {brief_repr(over)}")
     checked_choice("against", against, ("belt_speed",))
-    name = checked_choice("over", over[0], tuple(known for known in parameters.values if known != "belt_speed"))
-    low, high = (checked_number(f"over, {name},", value, *RANGES.get(name, (-1e12, 1e12))) for value in over[1:])
-    if not low < high:
-        raise ValueError(f"over must be (name, low, high) with low < high, got {over!r}")
-    return name, low, high
+    return checked_range(over, tuple(known for known in parameters.values if known != "belt_speed"))
 
 
 # Curves ---------------------------------------------------------------------------------------------------------------

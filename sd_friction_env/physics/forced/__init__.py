@@ -8,6 +8,7 @@ exist: such events are counted in ``singular_events``, and passed over.
 """
 
 from sd_friction_env.physics.forced.basins import LOST_CONTACT, UNDECIDED, ForcedBasins, forced_basins
+from sd_friction_env.physics.forced.branches import OrbitBranch, doubled_orbit, follow_orbit
 from sd_friction_env.physics.forced.diagrams import Direction, bifurcation_diagram, response_curve
 from sd_friction_env.physics.forced.exponents import LyapunovExponent, lyapunov_exponent
 from sd_friction_env.physics.forced.orbits import ForcedOrbit, forced_orbit
@@ -20,9 +21,12 @@ __all__ = [
     "ForcedBasins",
     "ForcedOrbit",
     "LyapunovExponent",
+    "OrbitBranch",
     "bifurcation_diagram",
     "dithered_amplitude",
+    "doubled_orbit",
     "drive_period",
+    "follow_orbit",
     "forced_basins",
     "forced_orbit",
     "lyapunov_exponent",

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from sd_friction_env import kernel
-from sd_friction_env.physics.forced.sections import MOST_CYCLES, Stroboscope, stroboscope
+from sd_friction_env.physics.forced.sections import MOST_CYCLES, Stroboscope, at_phase, stroboscope
 from sd_friction_env.physics.orbits import OrbitError
 from sd_friction_env.physics.parameters import STATE_LIMIT, OscillatorParameters, checked_count
-from sd_friction_env.physics.simulation import amplitude
+from sd_friction_env.physics.simulation import Trajectory, amplitude, simulate
 from sd_friction_env.physics.theory import FloatArray
 
 _SAME_POINT = 1e-6  # section points closer than this repeat, before Newton's method decides
@@ -53,6 +53,13 @@ class ForcedOrbit:
     stable: bool
     singular_events: int
     parameters: OscillatorParameters
+
+    def trajectory(self, samples: int = 1000) -> Trajectory:
+        """Return one period of the motion; its time begins at the section, and its parameters' phases with it."""
+        moved = at_phase(self.parameters, self.phase * self.period / self.multiple)
+        return simulate(
+            moved, self.x, self.v, self.period, dt=self.period / checked_count("samples", samples, 1, 10**7)
+        )
 
 
 def forced_orbit(
@@ -166,8 +173,13 @@ def _closed_orbit(strobe: Stroboscope, state: tuple[float, float], multiple: int
     away = strobe._replace(phase=strobe.phase + time / strobe.period)
     begin = _end(strobe, state, time)
     found = None if begin is None else _converged_state(away, begin, multiple)
-    start = None if found is None else _end(away, found, multiple * strobe.period - time)
-    if found is None or start is None:
+    return None if found is None else orbit_at(strobe, away, found, multiple)
+
+
+def orbit_at(strobe: Stroboscope, away: Stroboscope, found: tuple[float, float], multiple: int) -> ForcedOrbit | None:
+    """Return the orbit of a fixed point of a section ``away`` from events as one of ``strobe``'s, or None."""
+    start = _end(away, found, (strobe.phase - away.phase) % multiple * strobe.period)
+    if start is None:
         return None
     end, tangent = lap_with_tangents(away, found, multiple)
     points = np.concatenate((np.array([start]), strobe.follow(start, 0, multiple).rows[:-1, :2]))

@@ -96,6 +96,17 @@ def active_excitations(parameters: OscillatorParameters, swept: str = "") -> lis
     ]
 
 
+def at_phase(parameters: OscillatorParameters, time: float) -> OscillatorParameters:
+    """Return the oscillator whose excitation is at t = 0 what it is here at a time."""
+    phases = {
+        f"{kind}_phase": math.remainder(
+            getattr(parameters, f"{kind}_phase") + time * getattr(parameters, f"{kind}_frequency"), 2.0 * math.pi
+        )
+        for kind in EXCITATIONS
+    }
+    return parameters.replace(**phases)
+
+
 def drive_period(parameters: OscillatorParameters) -> float:
     """Return the period of the excitation, 2 pi/frequency.
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # what __getattr__ below loads when first used, spelled out f
     from sd_friction_env.environments.states import EnvState
     from sd_friction_env.environments.task import Task
     from sd_friction_env.environments.wrappers import ScaledReward
-    from sd_friction_env.physics import forced, sweeps, theory
+    from sd_friction_env.physics import forced, shocks, signals, sweeps, theory
     from sd_friction_env.physics.basins import Basins, basin_grid
     from sd_friction_env.physics.charts import stability_chart
     from sd_friction_env.physics.curves import amplitude_curve, attractor_curves
@@ -109,6 +109,8 @@ _MODULES = {
     "observers": "control.observers",
     "plotting": "pictures.plotting",
     "policies": "control.policies",
+    "shocks": "physics.shocks",
+    "signals": "physics.signals",
     "sweeps": "physics.sweeps",
     "theory": "physics.theory",
 }
@@ -155,6 +157,8 @@ __all__ = [
     "policies",
     "read_rig",
     "return_with_gradient",
+    "shocks",
+    "signals",
     "simulate",
     "slip_cycles",
     "spring_law",

@@ -22,6 +22,7 @@ from sd_friction_env.control import sound
 from sd_friction_env.environments.ids import TASKS, environment_id
 from sd_friction_env.learning import evaluation
 from sd_friction_env.physics import signals
+from sd_friction_env.physics.parameters import checked_number
 from sd_friction_env.pictures.renderer import checked_size
 
 
@@ -106,7 +107,8 @@ def _add_video(parser: argparse.ArgumentParser) -> None:
 
 LISTEN_TEXT = """\
 Writes the velocity of the mass as sound: the passive limit cycle, then the same motion under control. An oscillator of
-a rig (--rig) is played at its own frequency if that is audible, any other at 440 Hz, or at --pitch."""
+a rig (--rig) is played at its own frequency if that is audible, any other at 440 Hz, or at --pitch. Levels below
+-120 dB are printed as -120 dB."""
 
 
 def _add_listen(parser: argparse.ArgumentParser) -> None:
@@ -126,19 +128,20 @@ def _listen(options: argparse.Namespace) -> int:
     parameters = one_of(options)
     pitch = sound.pitch_of(parameters, options.pitch)
     env_id = environment_id(options.task)
-    steps = 2 + math.ceil(options.seconds / pitch.unit / evaluation.make_env(env_id).task.control_interval)
+    seconds = checked_number("seconds", options.seconds, *sound.SECONDS)
+    steps = 2 + math.ceil(seconds / pitch.unit / evaluation.make_env(env_id).task.control_interval)
     env_kwargs = {"parameters": parameters, "episode_steps": max(steps, 1)}
     name = options.agent or ("threshold-follower" if options.task == "belt" else "velocity-feedback")
     policy = agent_of(name, env_id, gain=options.gain, env_kwargs=env_kwargs)
     env = evaluation.make_env(env_id, env_kwargs)
-    before, after = sound.squeal(env, policy, pitch, seconds=options.seconds, rate=options.rate)
+    before, after = sound.squeal(env, policy, pitch, seconds=seconds, rate=options.rate)
     sound.write_sound(options.out, np.concatenate([before, after]), options.rate)
     heard = signals.harmonics(before, 1.0 / options.rate, count=1)["frequency"][0]
     own = "" if math.isnan(pitch.own) else f", on the rig {pitch.own:.6g} Hz"
     print(f"one dimensionless unit of time is {pitch.unit:.6g} s of sound{own}")
     print(f"fundamental in the sound {heard:.4f} Hz, 1/T of the limit cycle {pitch.played:.4f} Hz")
     loud, quiet = (float(np.std(part[len(part) // 2 :])) for part in (before, after))
-    print(f"level under control, last half: {20.0 * math.log10(max(quiet, 1e-300) / loud):.1f} dB of the squeal's")
+    print(f"level under control, last half: {20.0 * math.log10(max(quiet / loud, 1e-6)):.1f} dB of the squeal's")
     return 0
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
+from scipy.interpolate import CubicSpline
 from scipy.io import wavfile
 
 from sd_friction_env.control.policies.policy import Policy, State
@@ -17,6 +18,7 @@ from sd_friction_env.physics.simulation import simulate
 from sd_friction_env.storage import atomic_file, checked_ending
 
 AUDIBLE = (20.0, 20_000.0)  # Hz
+SECONDS = (0.1, 60.0)  # of each part
 _PITCH = 440.0  # of a squeal that is not audible at its own frequency, Hz
 _FINER = 4  # samples computed for one written, so that harmonics above half the rate are filtered out
 _PEAK = 0.9  # of full scale
@@ -60,8 +62,7 @@ def squeal(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the velocity on the passive cycle, and from its end on under control, as samples of a sound, (n,) each.
 
-    The controller acts on the environment; its drive is then simulated with the events located exactly, four times as
-    finely as written, and low-pass filtered.
+    Both are computed four times as finely as written, with the events located exactly, and low-pass filtered.
 
     Args:
         env: of the cycle's parameters, unwrapped; its episodes must be long enough for the sound.
@@ -72,37 +73,45 @@ def squeal(
         OrbitError: if the mass loses contact.
         TypeError, ValueError: if an argument is not as said, or the rate is below 2.5 times the pitch.
     """
-    seconds = checked_number("seconds", seconds, 0.1, 60.0)
+    seconds = checked_number("seconds", seconds, *SECONDS)
     rate = checked_count("rate", rate, 8_000, 192_000)
     if pitch.played > 0.4 * rate:
         raise ValueError(f"rate must be at least 2.5 times the pitch of {pitch.played:g} Hz, got {rate}")
-    parameters, hold = pitch.cycle.parameters, env.task.control_interval
-    size, dt = _FINER * round(seconds * rate), 1.0 / (pitch.unit * _FINER * rate)
+    parameters, size, dt = pitch.cycle.parameters, _FINER * round(seconds * rate), 1.0 / (pitch.unit * _FINER * rate)
     passive = simulate(parameters, *pitch.cycle.state(0.0), size * dt, dt=dt)
-    start = float(passive.x[-1]), float(passive.v[-1])
-    force, belt = _drives(env, policy, start, math.ceil(size * dt / hold) + 1)
-    controlled = simulate(parameters, *start, size * dt, dt=dt, force=force, belt_acceleration=belt, hold=hold)
-    for motion in (passive, controlled):
-        if motion.status != "ok":
-            raise OrbitError(f"{motion.status} at t = {motion.t[-1]:.6g}; {parameters}")
-    before, after = (signal.decimate(motion.v[:size], _FINER, ftype="fir") for motion in (passive, controlled))
+    if passive.status != "ok":
+        raise OrbitError(f"{passive.status} at t = {passive.t[-1]:.6g}; {parameters}")
+    times, velocities = _controlled(env, policy, (float(passive.x[-1]), float(passive.v[-1])), size * dt, dt)
+    controlled = CubicSpline(times, velocities)(dt * np.arange(size))
+    before, after = (signal.decimate(v, _FINER, ftype="fir") for v in (passive.v[:size], controlled))
     return before, after
 
 
-def _drives(env: SDFrictionEnv, policy: Policy, start: tuple[float, float], steps: int) -> NDArray[np.float64]:
-    """Return the force and the belt's acceleration in each of ``steps`` control intervals from a start, (2, steps)."""
+def _controlled(
+    env: SDFrictionEnv, policy: Policy, start: tuple[float, float], t_end: float, dt: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return times up to t_end or later, evenly spaced by dt or less, and the velocities under control from a start.
+
+    Each control interval is simulated from the environment's own state: at rest on the sliding belt the motion is
+    unstable without the controller, and a replay of its actions would vibrate again.
+    """
+    hold = env.task.control_interval
+    steps, samples = math.ceil(t_end / hold) + 1, math.ceil(hold / dt)
     if env.task.episode_steps < steps:
         raise ValueError(f"episode_steps must be at least {steps} for this sound, got {env.task.episode_steps}")
-    drives = np.zeros((2, steps))
-    observation, _ = env.reset(seed=0, options={"x": start[0], "v": start[1]})
+    velocities = np.empty((steps, samples))
+    observation, info = env.reset(seed=0, options={"x": start[0], "v": start[1]})
     state: State = None
     for step in range(steps):
+        x, v, parameters = info["x"], info["v"], env.nominal.replace(belt_speed=info["v_belt"])
         actions, state = policy.predict(observation[None], state, np.array([step == 0]))
         observation, _, terminated, _, info = env.step(actions[0])
-        drives[:, step] = info["force"], info["belt_acceleration"]
         if terminated:
             raise OrbitError(f"the mass loses contact under control at t = {info['time']:.6g}")
-    return drives
+        drive = {"force": info["force"], "belt_acceleration": info["belt_acceleration"]}
+        velocities[step] = simulate(parameters, x, v, hold, dt=hold / samples, **drive).v[:samples]
+    times: NDArray[np.float64] = (hold / samples) * np.arange(velocities.size, dtype=np.float64)
+    return times, velocities.ravel()
 
 
 def write_sound(path: str | os.PathLike[str], samples: NDArray[np.float64], rate: int = 44_100) -> None:

@@ -98,8 +98,8 @@ def test_training_with_a_seed_gives_the_same_network(monkeypatch):
 
 
 def test_the_shipped_followers_do_what_their_pages_say():
-    """At least: other machines multiply matrices in another order."""
-    for env_id, least in ():
+    """Other machines multiply matrices in another order, hence the margin."""
+    for env_id, least in ((BLIND, 0.7), ("SDFriction/BeltSpeedBlindHard-v0", 0.3)):
         policy = recurrent_follower(gym.make(env_id))
         table = evaluation.evaluate(policy, env_id, evaluation.VALIDATION_SEEDS)
         assert table["suppressed"].mean() >= least, env_id

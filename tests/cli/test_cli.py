@@ -387,7 +387,8 @@ def test_integrity_and_response_write_tables(tmp_path, capsys):
     assert table["force_frequency"].tolist() == [0.9, 1.0, 1.1, 1.1, 1.0, 0.9]
     assert table["amplitude"][1] == pytest.approx(1.0, rel=1e-6)
     assert plot.stat().st_size > 1000
-    assert capsys.readouterr().err == ""
+    said = capsys.readouterr().err.splitlines()
+    assert [line for line in said if "compiling" not in line] == []  # which a new machine says once
 
 
 def test_a_refined_curve_has_the_critical_speeds_from_both_sides():

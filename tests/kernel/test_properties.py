@@ -125,6 +125,7 @@ CHANGES = {
     "w_stick": 0.6,
     "start": "random",
     "randomise": {"alpha": (0.7, 0.8)},
+    "drift": {"mu_m": (0.1, 0.12)},
     "show_parameters": True,
     "show_phases": True,
     "sensor": "position",

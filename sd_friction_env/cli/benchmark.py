@@ -28,7 +28,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     run = actions.add_parser("run", help="evaluate a controller and write its entry; the same command resumes")
     run.add_argument("--policy", required=True, help=AGENTS_TEXT)
     run.add_argument("--name", required=True, help="of the entry's rows")
-    run.add_argument("--told", default="", metavar="TEXT", help="what it knows of the plant (default: nothing)")
+    run.add_argument("--knows", default="", metavar="TEXT", help="what it knows of the plant (default: nothing)")
     run.add_argument("--out", type=Path, required=True, metavar="FILE.json", help="file to write")
     run.add_argument("--overwrite", action="store_true", help="begin again, in place of what --out holds")
     verify = actions.add_parser("verify", help="run an entry's controller again and compare")
@@ -85,7 +85,7 @@ def _fitting(spec: str, env_ids: list[str]) -> dict[str, Policy]:
 def _run(options: argparse.Namespace) -> int:
     out: Path = options.out
     check_file("--out", out, ".json")
-    entry = protocol.new_entry(options.name, options.policy, options.told)
+    entry = protocol.new_entry(options.name, options.policy, options.knows)
     if out.exists() and not options.overwrite:
         try:
             entry = protocol.resumed(entry, out)

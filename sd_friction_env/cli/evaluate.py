@@ -39,7 +39,7 @@ Score and suppressed have 95% intervals over the episodes. Amplitude, reduction,
 half of the episodes; settling is the mean time of those that settle; residual is the rms action of the last quarter; ms
 is the wall time of one decision for one environment. --controller classical stands for all classical controllers that
 were tuned for the environment. alpha-beta, particle, ensemble and kalman are observers, with the rule of
-threshold-follower, its rollout, or the trained agent that sees the state: each but alpha-beta is told the model, the
+threshold-follower, its rollout, or the trained agent that sees the state: each but alpha-beta knows the model, the
 ranges of the hidden parameters, and the sensor's noise and delay."""
 
 GRID_TEXT = """\

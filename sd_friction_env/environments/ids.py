@@ -18,7 +18,7 @@ _TIERS: dict[str, tuple[str, dict[str, Any]]] = {
     "randomised": ("Randomised", {"randomise": _PLANTS}),
     "sensed": ("Sensed", _position(0.005, 1)),
 }
-# Tiers of the belt task that are still open: no controller without a model solves them.
+# Tiers of the belt task that are still open (docs/howto/observers.md has what controllers reach).
 _OPEN_TIERS: dict[str, tuple[str, dict[str, Any]]] = {
     "blind": ("Blind", {"randomise": _PLANTS, **_position(0.005, 1)}),
     "blind-late": ("BlindLate", {"randomise": _PLANTS, **_position(0.01, 3)}),

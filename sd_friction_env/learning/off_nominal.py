@@ -37,7 +37,7 @@ def evaluate_off_nominal(
 ) -> Table:
     """Return the suppressed share and the mean return of each policy on each plant, from the same starts.
 
-    Scales of observations stay those of the nominal plant, so that they tell nothing of the change.
+    Scales of observations stay those of the nominal plant, so that they do not show the change.
 
     Args:
         policies: by name. env_id: of an environment. seeds: of the episodes on each plant. plants: the parameters that

@@ -2,7 +2,7 @@
 
 An entry is a sealed JSON file: for each environment the return of the protocol's 100 episodes, which of them were
 suppressed, rms action and time of a decision, and a fingerprint of the environment (spaces, task, plant, golden
-rollout; after the first environment only what differs from the first); its name, its policy, what that was told of the
+rollout; after the first environment only what differs from the first); its name, its policy, what that knows of the
 plant, and versions. Returns are stored to 0.1, and :data:`TOLERANCE` is what they may differ by.
 """
 
@@ -29,7 +29,7 @@ KIND, FORMAT = "sd_friction_env benchmark entry", 1
 # Of a return: 0.0002 of a score. Half of it is the rounding of stored returns, the rest is for builds that round
 # differently (docs/howto/benchmark.md).
 TOLERANCE = 0.1
-_ABOUT = ("name", "policy", "told")  # texts of an entry: they say whether another one is the same
+_ABOUT = ("name", "policy", "knows")  # texts of an entry: they say whether another one is the same
 _GOLDEN_ROWS = slice(None, None, 4)  # of the fingerprint's rollout: the last one depends on all before it
 
 
@@ -118,18 +118,18 @@ def _fingerprint(env_id: str) -> dict[str, Any]:
 # Entries --------------------------------------------------------------------------------------------------------------
 
 
-def new_entry(name: str, policy: str, told: str = "") -> dict[str, Any]:
+def new_entry(name: str, policy: str, knows: str = "") -> dict[str, Any]:
     """Return an entry without results.
 
     Args:
-        name: of its rows. policy: what makes it, for :func:`differences`. told: what it knows of the plant.
+        name: of its rows. policy: what makes it, for :func:`differences`. knows: of the plant.
 
     Raises:
         ValueError: if the name is empty, or a text has several lines.
     """
-    about = dict(zip(_ABOUT, (name, policy, told), strict=True))
+    about = dict(zip(_ABOUT, (name, policy, knows), strict=True))
     for key, text in about.items():
-        if len(text.splitlines()) > 1 or "|" in text or (key != "told" and not text.strip()):
+        if len(text.splitlines()) > 1 or "|" in text or (key != "knows" and not text.strip()):
             raise ValueError(f"{key} must be one line of text without '|', got {text!r}")
     return {**about, "versions": versions(), "environments": {}}
 
@@ -255,9 +255,9 @@ def _flags(result: Mapping[str, Any]) -> NDArray[np.bool_]:
 
 # The leaderboard ------------------------------------------------------------------------------------------------------
 
-BLOCKS = ("told the plant", "not told")
+BLOCKS = ("knows the plant", "does not know the plant")
 _SUMMARY = ("score", "score_low", "score_high", "scored_episodes", "credited", "suppressed", "return")
-_TEXTS = ("environment", "entry", "told")  # first columns of the Markdown
+_TEXTS = ("environment", "entry", "knows")  # first columns of the Markdown
 _NUMBERS = {
     "score": "{:.3f}",
     "credited": "{:.3f}",
@@ -287,11 +287,11 @@ def leaderboard(entries: Iterable[Mapping[str, Any]], env_ids: Sequence[str] = E
         baseline = evaluation.metrics(passive, passive)
         table = Table({**baseline, "return": np.array(result["returns"]), "suppressed": _flags(result)})
         summary = evaluation.summarise(entry["name"], table, baseline, evaluation.optimal_returns(env_id, SEEDS))
-        about = {"block": BLOCKS[not entry["told"]], "environment": env_id, "entry": entry["name"]}
+        about = {"block": BLOCKS[not entry["knows"]], "environment": env_id, "entry": entry["name"]}
         effort = {"worst_start": min(result["returns"])} | {
             name: result[name] for name in ("rms_action", "milliseconds")
         }
-        rows.append(about | {"told": entry["told"] or "-"} | {name: summary[name] for name in _SUMMARY} | effort)
+        rows.append(about | {"knows": entry["knows"] or "-"} | {name: summary[name] for name in _SUMMARY} | effort)
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:
         place = BLOCKS.index(row["block"]), ENVIRONMENT_IDS.index(row["environment"])

@@ -30,7 +30,7 @@ from sd_friction_env.physics.tables import Table
 
 BORDERS: dict[str, type[Border]] = {"v_b0": GrazingBorder, "v_b1": HopfBorder, "fold": FoldBorder}
 _STARTS = 5  # values of the second parameter at which curves are looked for
-_COLUMNS = 301  # values of it at which regions are told apart
+_COLUMNS = 301  # values of it at which regions are distinguished
 _NAMES = {"stick-slip": "stick-slip", "pure-slip": "pure slip", "steady-slip": "steady slip", "neutral": "neutral"}
 _LEAST_BELT_SPEED = 1e-3
 

@@ -62,7 +62,7 @@ FORCE = ["--task", "force", "--tier", "nominal", "randomised"]
 
 def test_a_strangers_policy_is_run_verified_and_ranked(mine, tmp_path, capsys):
     assert run("--policy", f"{mine}:Mine", "--name", "mine", "--out", "a.json", *FORCE) == 0
-    assert run("--policy", f"{mine}:strong", "--name", "strong", "--told", "the force", "--out", "b.json") == 0
+    assert run("--policy", f"{mine}:strong", "--name", "strong", "--knows", "the force", "--out", "b.json") == 0
     said = capsys.readouterr()
     assert said.out.count("100 of 100 episodes suppressed") == 4
     assert "SDFriction/BeltSpeed-v0 is left out: it needs a force and the velocity" in said.err
@@ -77,9 +77,9 @@ def test_a_strangers_policy_is_run_verified_and_ranked(mine, tmp_path, capsys):
     capsys.readouterr()
     assert main(["benchmark", "table", "a.json", "b.json", "--tier", "nominal", "--format", "csv"]) == 0
     header, first, second = capsys.readouterr().out.splitlines()
-    assert header.startswith("block,environment,entry,told,score,score_low,score_high,")
-    assert first.startswith("told the plant,SDFriction/Force-v0,strong,the force,0.9")
-    assert second.startswith("not told,SDFriction/Force-v0,mine,-,0.9")
+    assert header.startswith("block,environment,entry,knows,score,score_low,score_high,")
+    assert first.startswith("knows the plant,SDFriction/Force-v0,strong,the force,0.9")
+    assert second.startswith("does not know the plant,SDFriction/Force-v0,mine,-,0.9")
     assert main(["benchmark", "table", "a.json", "b.json"]) == 0
     assert capsys.readouterr().out.count("###") == 2
 

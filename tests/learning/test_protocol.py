@@ -66,7 +66,7 @@ def test_environments_after_the_first_are_stored_as_what_differs_from_it(entry, 
 def test_an_entry_changed_by_hand_differs_from_its_digest(path):
     text = path.read_text()
     for old, new in (
-        ('"told": ""', '"told": "x"'),
+        ('"knows": ""', '"knows": "x"'),
         (
             "[-",
             "[-1",
@@ -163,7 +163,7 @@ def test_an_entry_of_another_environment_names_what_changed(path, monkeypatch):
 
 def test_only_the_same_entry_is_resumed(path, made):
     assert protocol.resumed(protocol.new_entry("feedback", "velocity-feedback"), path) == made
-    for changes in ({"name": "other"}, {"policy": "rollout"}, {"told": "all"}):
+    for changes in ({"name": "other"}, {"policy": "rollout"}, {"knows": "all"}):
         other = protocol.new_entry(**{"name": "feedback", "policy": "velocity-feedback"} | changes)
         (key, value) = next(iter(changes.items()))
         with pytest.raises(EntryError, match=rf"entry\.json' holds another entry: its {key} is .*, not '{value}'"):
@@ -213,9 +213,9 @@ def test_every_decision_is_reported():
 # The leaderboard ------------------------------------------------------------------------------------------------------
 
 
-def changed_entry(made, name, told, change, suppressed="1"):
+def changed_entry(made, name, knows, change, suppressed="1"):
     """Return an entry with other returns, of the same environments."""
-    other = copy.deepcopy(made) | {"name": name, "told": told}
+    other = copy.deepcopy(made) | {"name": name, "knows": knows}
     for result in other["environments"].values():
         result["returns"] = [value + change for value in result["returns"]]
         result["suppressed"] = suppressed * 100
@@ -227,9 +227,9 @@ def test_the_table_has_two_blocks_and_the_best_first(made):
     knows = changed_entry(made, "knows", "the plant", 2.0, suppressed="0")
     rows = protocol.leaderboard([worse, knows, made, better])
     assert [(row["block"], row["environment"], row["entry"]) for row in rows] == [
-        ("told the plant", FORCE, "knows"),
-        ("told the plant", HIDDEN, "knows"),
-        *(("not told", env_id, name) for env_id in (FORCE, HIDDEN) for name in ("better", "feedback", "worse")),
+        ("knows the plant", FORCE, "model"),
+        ("knows the plant", HIDDEN, "model"),
+        *(("does not know the plant", env_id, name) for env_id in (FORCE, HIDDEN) for name in ("better", "feedback", "worse")),
     ]
     passive = evaluation.metrics(*[evaluation.passive_episodes(FORCE)] * 2)
     summary = evaluation.summarise(
@@ -243,14 +243,14 @@ def test_the_table_has_two_blocks_and_the_best_first(made):
     assert rows[4]["scored_episodes"] == 100
     assert rows[5]["scored_episodes"] == 32
     text = protocol.as_markdown(rows)
-    told, not_told = text.split("### Not told")
-    assert told.startswith(
-        "### Told the plant\n\n| environment | entry | told | score | credited | suppressed | return |"
+    first, second = text.split("### Does not know the plant")
+    assert first.startswith(
+        "### Knows the plant\n\n| environment | entry | knows | score | credited | suppressed | return |"
     )
-    assert told.count("| knows | the plant |") == 2
-    assert "feedback" not in told
-    assert not_told.count("| feedback | - |") == 2
-    assert "(32 starts)" in not_told
+    assert first.count("| model | the plant |") == 2
+    assert "feedback" not in first
+    assert second.count("| feedback | - |") == 2
+    assert "(32 starts)" in second
     assert protocol.leaderboard([made], [BELT]) == []
     slow = changed_entry(made, "slow", "", 2.0, suppressed="0")
     assert [row["entry"] for row in protocol.leaderboard([made, slow], [FORCE])] == ["slow", "feedback"]

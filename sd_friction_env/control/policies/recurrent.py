@@ -23,7 +23,7 @@ _KIND = "sd_friction_env recurrent follower"
 class RecurrentFollower:
     """:class:`ThresholdFollower` for a sensor of x alone, on a network's estimates of velocity and nominal belt speed.
 
-    The network is told nothing but readings and its own actions: a gated recurrent unit (K. Cho et al., Learning phrase
+    The network sees readings and its own actions only: a gated recurrent unit (K. Cho et al., Learning phrase
     representations using RNN encoder-decoder, EMNLP 2014, in PyTorch's form) and a linear map. It was trained on
     simulated episodes with the true velocity and belt speed as targets.
 

@@ -376,16 +376,13 @@ class OscillatorParameters:
     def plant_change(self, name: str, *, excited: bool | None = None) -> NDArray[np.float64]:
         """Return the derivatives of the plant's numbers (``kernel.leaf_names``) by a parameter, of its form by default.
 
-        They are exact: a step of 1e-20 in the imaginary direction has no rounding error (Squire and Trapp, 1998).
-
         Raises:
             ValueError: if there is no such parameter, the plant does not use it, or its law offers no derivatives.
         """
         kind = self.kind if excited is None else self.kind._replace(excited=excited)
         if name not in self.values:
             raise ValueError(f"unknown parameter {name!r}; allowed: {', '.join(self.values)}")
-        plant = plant_of(kind, self.values | {name: complex(self.values[name], 1e-20)})
-        changes = np.imag(np.array(kernel.leaves_of(plant, self.plant if excited is None else None))) / 1e-20
+        changes = plant_derivative(kind, self.values, name, self.plant if excited is None else None)
         if not changes.any():
             raise ValueError(f"the plant does not use the parameter {name!r}: {self}")
         law = getattr(self, name.partition(".")[0]) if "." in name else None
@@ -468,6 +465,15 @@ def _with_numbers(law: Any, prefix: str, values: Mapping[str, Any]) -> Any:
         path = prefix + name
         fields[name] = _with_numbers(value, f"{path}.", values) if nested else values.get(path, value)
     return type(law)(**fields)
+
+
+def plant_derivative(kind: Kind, values: Mapping[str, Any], name: str, like: Any = None) -> NDArray[np.float64]:
+    """Return the derivatives of a plant's numbers (``kernel.leaf_names``) by a parameter; ``like``: one of its form.
+
+    They are exact: a step of 1e-20 in the imaginary direction has no rounding error (Squire and Trapp, 1998).
+    """
+    plant = plant_of(kind, {**values, name: complex(values[name], 1e-20)})
+    return np.asarray(np.imag(np.array(kernel.leaves_of(plant, like))) / 1e-20)
 
 
 def plant_of(kind: Kind, values: Mapping[str, Any]) -> Plant:

@@ -229,7 +229,11 @@ def test_the_table_has_two_blocks_and_the_best_first(made):
     assert [(row["block"], row["environment"], row["entry"]) for row in rows] == [
         ("knows the plant", FORCE, "model"),
         ("knows the plant", HIDDEN, "model"),
-        *(("does not know the plant", env_id, name) for env_id in (FORCE, HIDDEN) for name in ("better", "feedback", "worse")),
+        *(
+            ("does not know the plant", env_id, name)
+            for env_id in (FORCE, HIDDEN)
+            for name in ("better", "feedback", "worse")
+        ),
     ]
     passive = evaluation.metrics(*[evaluation.passive_episodes(FORCE)] * 2)
     summary = evaluation.summarise(

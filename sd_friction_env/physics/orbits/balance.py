@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -194,18 +195,32 @@ def equilibria(parameters: OscillatorParameters) -> list[Equilibrium]:
         return []
     plant = parameters.plant
     coefficient = -float(plant.friction.coefficient(kernel.SLIP_BACKWARD, -speed))
-    slope = float(plant.friction.slope(kernel.SLIP_BACKWARD, -speed))
     found = []
     for x in balance_points(parameters, 0.0, coefficient):
-        normal = kernel.normal_force(plant, x)
-        if normal <= 0.0:
+        if kernel.normal_force(plant, x) <= 0.0:
             continue
-        stiffness = plant.spring.restoring_slope(x) - coefficient * plant.spring.normal_slope(x)
-        damping = 2.0 * parameters.beta + normal * slope
+        stiffness, damping, _ = slip_slopes(plant, kernel.SLIP_BACKWARD, x, -speed)
         root = cmath.sqrt(damping * damping - 4.0 * stiffness)
         pair = (0.5 * (-damping + root), 0.5 * (-damping - root))
         found.append(Equilibrium(x=x, eigenvalues=pair, stable=damping > 0.0 and stiffness > 0.0))
     return found
+
+
+class SlipSlopes(NamedTuple):
+    """How the acceleration in slip changes: by -stiffness dx - damping dv + grip dv_belt."""
+
+    stiffness: float
+    damping: float
+    grip: float
+
+
+def slip_slopes(plant: Any, mode: int, x: float, v_rel: float) -> SlipSlopes:
+    """Return how the acceleration of an unexcited plant changes in slip at x and a relative velocity."""
+    stiffness = kernel.restoring_slope(plant, x) + plant.friction.coefficient(mode, v_rel) * kernel.normal_slope(
+        plant, x
+    )
+    grip = plant.friction.slope(mode, v_rel) * kernel.normal_force(plant, x)
+    return SlipSlopes(float(stiffness), float(2.0 * plant.beta + grip), float(grip))
 
 
 @functools.lru_cache(maxsize=256)

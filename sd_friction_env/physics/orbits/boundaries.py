@@ -14,10 +14,10 @@ from sd_friction_env import kernel
 from sd_friction_env.kernel.plant_gradients import contact_gradient, external_gradient
 from sd_friction_env.physics.continuation import BranchEndError, correct
 from sd_friction_env.physics.laws import missing_gradient
-from sd_friction_env.physics.orbits.balance import balance_points, check_unexcited, equilibria
+from sd_friction_env.physics.orbits.balance import balance_points, check_unexcited, equilibria, slip_slopes
 from sd_friction_env.physics.orbits.critical import grazing_belt_speed, hopf_belt_speed, lyapunov_coefficient
 from sd_friction_env.physics.orbits.limits import slip_cycles
-from sd_friction_env.physics.parameters import OscillatorParameters, plant_of
+from sd_friction_env.physics.parameters import OscillatorParameters, plant_derivative, plant_of
 from sd_friction_env.physics.theory import FloatArray
 
 _BEFORE_LANDING = 1e-5  # time before a landing at which an orbit that overshoots is left
@@ -75,11 +75,8 @@ class Border:
     def directions(self, y: FloatArray) -> FloatArray:
         """Return the derivatives of the plant's numbers by the parameters, (parameters, numbers): a complex step."""
         values = self.values(y)
-        rows = []
-        for name in self.names:
-            plant = plant_of(self.parameters.kind, values | {name: complex(values[name], 1e-20)})
-            rows.append(np.imag(np.array(kernel.leaves_of(plant, self.parameters.plant))) / 1e-20)
-        return np.array(rows)
+        kind, like = self.parameters.kind, self.parameters.plant
+        return np.array([plant_derivative(kind, values, name, like) for name in self.names])
 
     def residual(self, y: FloatArray) -> FloatArray:
         """Return the residual of the border's equations at y."""
@@ -115,7 +112,7 @@ class Border:
         if not 0.0 < time < _LONGEST_ORBIT:
             raise BranchEndError(f"the orbit takes longer than {_LONGEST_ORBIT:g}: it passes ever closer to a saddle")
         plant, speed = self.at(y)
-        state, belt = kernel.State(x, v), kernel.Drive(speed, 0.0, 0.0)
+        state, belt = kernel.State(x, v), kernel.steady(speed)
         sample, met = np.empty((1, 4)), np.empty((kernel.MAX_EVENTS, 4))
         traced = kernel.trace(plant, kernel.SLIP_BACKWARD, state, belt, np.array([time]), sample, met)
         lands = traced.events > events
@@ -146,13 +143,12 @@ class Border:
         by = np.zeros((3, columns))
         if columns:
             x, w = place.x, place.v - speed
-            normal, friction = kernel.normal_force(plant, x), plant.friction
-            mu, grip = friction.coefficient(mode, w), friction.slope(mode, w) * normal
-            stiffness = plant.spring.restoring_slope(x) + mu * plant.spring.normal_slope(x)
+            stiffness, damping, grip = slip_slopes(plant, mode, x, w)
             dx, dv = tangents[[kernel.TANGENT_X, kernel.TANGENT_V]]
-            da = -stiffness * dx - (2.0 * plant.beta + grip) * dv + grip * on_belt
+            da = -stiffness * dx - damping * dv + grip * on_belt
             if changes is not None:
-                by_numbers = forces_by_numbers(plant, x, place.v, mu, friction.coefficient_gradient(mode, w))
+                mu, by_friction = plant.friction.coefficient(mode, w), plant.friction.coefficient_gradient(mode, w)
+                by_numbers = forces_by_numbers(plant, x, place.v, mu, by_friction)
                 da[len(order) - len(last) :] -= changes @ by_numbers
             by[:, order] = dx + rest * dv, dv + rest * da, da
         if lands:
@@ -189,13 +185,11 @@ class HopfBorder(Border):
 
     def residual(self, y: FloatArray) -> FloatArray:
         """Return both sides' difference of the two equations."""
-        plant, speed = self.at(y)
-        x, friction, spring = y[0], plant.friction, plant.spring
-        normal = spring.normal_force(plant.g1, x)
-        if normal <= 0.0:
+        (plant, speed), mode = self.at(y), kernel.SLIP_BACKWARD
+        if kernel.normal_force(plant, y[0]) <= 0.0:
             raise BranchEndError("contact is lost at the equilibrium")
-        force = spring.restoring_force(x) + friction.coefficient(kernel.SLIP_BACKWARD, -speed) * normal
-        return np.array([force, 2.0 * plant.beta + normal * friction.slope(kernel.SLIP_BACKWARD, -speed)])
+        a = kernel.slip_acceleration(plant, mode, kernel.State(y[0], 0.0), kernel.steady(speed))
+        return np.array([-a, slip_slopes(plant, mode, y[0], -speed).damping])
 
     def jacobian(self, y: FloatArray) -> FloatArray:
         """Return the derivatives by (x, parameters)."""
@@ -203,7 +197,7 @@ class HopfBorder(Border):
         mode, x, spring = kernel.SLIP_BACKWARD, y[0], plant.spring
         mu, slope = plant.friction.coefficient(mode, -speed), plant.friction.slope(mode, -speed)
         normal, normal_slope = spring.normal_force(plant.g1, x), spring.normal_slope(x)
-        columns = [np.array([spring.restoring_slope(x) + mu * normal_slope, slope * normal_slope])]
+        columns = [np.array([slip_slopes(plant, mode, x, -speed).stiffness, slope * normal_slope])]
         by_speed = np.array([-slope * normal, -plant.friction.curvature(mode, -speed) * normal])
         if self.exact:
             # The derivatives of mu' are those of mu, differentiated by the relative velocity.
@@ -227,8 +221,7 @@ class HopfBorder(Border):
     def period(self, y: FloatArray) -> float:
         """Return the period of small orbits at the Hopf point, NaN where the equilibrium is a saddle."""
         plant, speed = self.at(y)
-        mu = plant.friction.coefficient(kernel.SLIP_BACKWARD, -speed)
-        stiffness = plant.spring.restoring_slope(y[0]) + mu * plant.spring.normal_slope(y[0])
+        stiffness = slip_slopes(plant, kernel.SLIP_BACKWARD, y[0], -speed).stiffness
         return 2.0 * math.pi / math.sqrt(stiffness) if stiffness > 0.0 else math.nan
 
     def lyapunov(self, y: FloatArray) -> float:
@@ -258,10 +251,11 @@ class GrazingBorder(Border):
 
     def breakaway(self, plant: Any, speed: float, x: float) -> tuple[float, float]:
         """Return the breakaway point near x, and by how much the balance of forces is missed at x itself."""
-        spring, mu = plant.spring, plant.friction.breakaway_coefficient(kernel.SLIP_BACKWARD)
+        spring, mode = plant.spring, kernel.SLIP_BACKWARD
+        mu, belt = plant.friction.breakaway_coefficient(mode), kernel.steady(speed)
 
         def missed(x: float) -> float:
-            return float(2.0 * plant.beta * speed + spring.restoring_force(x) - mu * spring.normal_force(plant.g1, x))
+            return float(kernel.stick_load(plant, x, belt) - kernel.stick_limit(plant, mode, x))
 
         at_x, x0 = missed(x), x
         for _ in range(20):
@@ -272,7 +266,7 @@ class GrazingBorder(Border):
             x -= step
             if abs(step) <= 4e-16 * max(1.0, abs(x)):
                 break
-        if spring.normal_force(plant.g1, x) <= 0.0:
+        if kernel.normal_force(plant, x) <= 0.0:
             raise BranchEndError("contact is lost at the breakaway")
         return x, at_x
 
@@ -324,7 +318,7 @@ class GrazingBorder(Border):
         load = 2.0 * p.beta * speed
         x = balance_points(p, load, p.plant.friction.breakaway_coefficient(kernel.SLIP_BACKWARD))[-1]
         met = np.empty((4 * kernel.MAX_EVENTS, 4))
-        drive, state = kernel.Drive(speed, 0.0, 0.0), kernel.State(x, speed)
+        drive, state = kernel.steady(speed), kernel.State(x, speed)
         traced = kernel.trace(
             p.plant, kernel.SLIP_BACKWARD, state, drive, np.array([_LONGEST_ORBIT]), np.empty((1, 4)), met
         )
@@ -382,7 +376,7 @@ class FoldBorder(Border):
     def residual(self, y: FloatArray) -> FloatArray:
         """Return by how much x and v = 0 are missed after the lap, and the multiplier less 1."""
         plant, speed = self.at(y)
-        belt = kernel.Drive(speed, 0.0, 0.0)
+        belt = kernel.steady(speed)
         if kernel.slip_acceleration(plant, kernel.SLIP_BACKWARD, kernel.State(y[0], 0.0), belt) > -_LEAST_CYCLE:
             raise BranchEndError("the cycle shrinks to the equilibrium: a Bautin point of v_b1")
         end = self.orbit(y, y[0], 0.0, y[1], self.events, np.eye(2))

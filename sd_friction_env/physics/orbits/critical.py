@@ -6,7 +6,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from sd_friction_env import kernel
-from sd_friction_env.physics.orbits.balance import balance_points, check_unexcited, equilibria, find_root, traps_of
+from sd_friction_env.physics.orbits.balance import (
+    balance_points,
+    check_unexcited,
+    equilibria,
+    find_root,
+    slip_slopes,
+    traps_of,
+)
 from sd_friction_env.physics.parameters import RANGES, OscillatorParameters
 from sd_friction_env.physics.theory import FloatArray
 
@@ -62,8 +69,7 @@ def hopf_belt_speed(parameters: OscillatorParameters) -> float:
         points = balance_points(parameters, 0.0, coefficient)
         if not points:
             return math.nan
-        normal = kernel.normal_force(plant, points[-1])
-        return float(2.0 * parameters.beta + normal * plant.friction.slope(kernel.SLIP_BACKWARD, -speed))
+        return slip_slopes(plant, kernel.SLIP_BACKWARD, points[-1], -speed).damping
 
     check_unexcited(parameters)
     high, *lower = _belt_speeds_to_search(parameters).tolist()
@@ -108,7 +114,7 @@ def lyapunov_coefficient(plant: Any, speed: float, x: float) -> float:
     curvature, third = friction.curvature(mode, w), friction.third_derivative(mode, w)
     normal_slope, normal_curvature = spring.normal_slope(x), spring.normal_curvature(x)
     normal = spring.normal_force(plant.g1, x)
-    square = spring.restoring_slope(x) + coefficient * normal_slope  # omega^2
+    square = slip_slopes(plant, mode, x, w).stiffness  # omega^2
     f_xx = -spring.restoring_curvature(x) - coefficient * normal_curvature
     f_xv = -slope * normal_slope
     f_vv = -curvature * normal

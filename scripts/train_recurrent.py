@@ -13,7 +13,7 @@ import torch
 from tqdm import tqdm
 
 from sd_friction_env.cli.options import Parser, check_at_least
-from sd_friction_env.control.pretrained import RECURRENT, recurrent_file
+from sd_friction_env.control.pretrained import RECURRENT, fingerprint, recurrent_file
 from sd_friction_env.environments.ids import OPEN_TIERS, environment_id
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.recurrent import train_follower
@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for tier in options.tier:
         env_id = environment_id("belt", tier)
         about = {"env_id": env_id, "seed": options.seed, "rounds": options.rounds, "versions": versions()}
+        about["fingerprint"] = fingerprint(env_id)
         with tqdm(total=options.rounds, desc=env_id, dynamic_ncols=True, mininterval=5.0) as bar:
 
             def show(done: int, error: float, mean_return: float, bar: "tqdm[None]" = bar) -> None:

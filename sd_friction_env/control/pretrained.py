@@ -42,13 +42,16 @@ def recurrent_follower(env: Any) -> RecurrentFollower:
     """Return the package's recurrent follower for an environment of an open tier; it needs only NumPy.
 
     Raises:
-        ValueError: if the package has none for it. PolicyFileError: if the file is damaged.
+        ValueError: if the package has none for it.
+        PolicyFileError: if the file is damaged, or was trained on another version of the environment.
     """
     env_id = bare_id(env.unwrapped.spec.id) if getattr(env.unwrapped, "spec", None) else ""
     if not env_id or not recurrent_file(env_id).exists():
         known = sorted(path.stem.replace("-", "/", 1) for path in RECURRENT.glob("*.npz"))
         raise ValueError(f"a recurrent follower was trained for {', '.join(known)}, got {env_id or env!r}")
-    return RecurrentFollower.load(recurrent_file(env_id), env)
+    policy = RecurrentFollower.load(recurrent_file(env_id), env)
+    _check_environment(recurrent_file(env_id), policy.metadata, env_id, "scripts/train_recurrent.py")
+    return policy
 
 
 def fingerprint(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -129,13 +132,18 @@ def load_pretrained(env_id: str) -> NetworkPolicy:
         raise ValueError(f"env_id must be one that an agent was trained for ({', '.join(known)}), got {env_id!r}")
     file = pretrained_file(env_id)
     policy = load_policy(file)
-    stored = policy.metadata.get("fingerprint")
-    if not isinstance(stored, dict) or policy.metadata.get("env_id") != bare_id(env_id):
-        raise PolicyFileError(f"{str(file)!r} is not an agent for {bare_id(env_id)}")
-    changed = changes_since(stored, fingerprint(bare_id(env_id)))
+    _check_environment(file, policy.metadata, bare_id(env_id), "scripts/pretrain.py")
+    return policy
+
+
+def _check_environment(file: Path, metadata: Mapping[str, Any], env_id: str, script: str) -> None:
+    """Raise PolicyFileError if an agent is not of an environment, or the environment has changed since its training."""
+    stored = metadata.get("fingerprint")
+    if not isinstance(stored, dict) or metadata.get("env_id") != env_id:
+        raise PolicyFileError(f"{str(file)!r} is not an agent for {env_id}")
+    changed = changes_since(stored, fingerprint(env_id))
     if changed:
         raise PolicyFileError(
-            f"the agent in {str(file)!r} was trained on another {bare_id(env_id)} ({'; '.join(changed)}): "
-            "train it again with scripts/pretrain.py"
+            f"the agent in {str(file)!r} was trained on another {env_id} ({'; '.join(changed)}): "
+            f"train it again with {script}"
         )
-    return policy

@@ -1,10 +1,14 @@
 """Recurrent followers: the network is PyTorch's, its file is checked, and training brings it closer to the truth."""
 
+import dataclasses
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
+from sd_friction_env.control import pretrained
 from sd_friction_env.control.policies import PolicyFileError, RecurrentFollower, ThresholdFollower
 from sd_friction_env.control.pretrained import recurrent_follower
 from sd_friction_env.learning import evaluation, recurrent
@@ -86,6 +90,19 @@ def test_readings_that_are_not_x_alone_are_refused():
         follower().predict(np.zeros((2, 3)))
     with pytest.raises(ValueError, match="must be finite"):
         follower().predict(np.array([np.nan]))
+
+
+def test_a_follower_of_another_version_of_the_environment_is_refused(tmp_path, monkeypatch):
+    env = gym.make(BLIND)
+    policy = recurrent_follower(env)
+    changed = json.loads(json.dumps(dict(policy.metadata)))
+    changed["fingerprint"]["golden"][0][0] += 1e-3
+    dataclasses.replace(policy, metadata=changed).save(tmp_path / "SDFriction-BeltSpeedBlind-v0.npz")
+    monkeypatch.setattr(pretrained, "RECURRENT", tmp_path)
+    with pytest.raises(PolicyFileError, match=r"trained on another SDFriction/BeltSpeedBlind-v0 .*train_recurrent"):
+        recurrent_follower(env)
+    with pytest.raises(ValueError, match="a recurrent follower was trained for SDFriction/BeltSpeedBlind-v0, got"):
+        recurrent_follower(gym.make("SDFriction/BeltSpeedExcited-v0"))
 
 
 def test_training_with_a_seed_gives_the_same_network(monkeypatch):

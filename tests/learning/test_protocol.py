@@ -224,8 +224,8 @@ def changed_entry(made, name, knows, change, suppressed="1"):
 
 def test_the_table_has_two_blocks_and_the_best_first(made):
     worse, better = changed_entry(made, "worse", "", -40.0), changed_entry(made, "better", "", 1.0)
-    knows = changed_entry(made, "knows", "the plant", 2.0, suppressed="0")
-    rows = protocol.leaderboard([worse, knows, made, better])
+    model = changed_entry(made, "model", "the plant", 2.0, suppressed="0")
+    rows = protocol.leaderboard([worse, model, made, better])
     assert [(row["block"], row["environment"], row["entry"]) for row in rows] == [
         ("knows the plant", FORCE, "model"),
         ("knows the plant", HIDDEN, "model"),

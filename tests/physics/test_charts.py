@@ -1,42 +1,21 @@
 """Stability charts: curves against direct roots and closed forms, their special points, the map at the graze."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from sd_friction_env import OscillatorParameters, friction_law, kernel, limit_cycle, slip_cycles, stability_chart
+from sd_friction_env import OscillatorParameters, kernel, limit_cycle, slip_cycles, stability_chart
 from sd_friction_env.physics.continuation import follow
 from sd_friction_env.physics.orbits import NoBorderError, grazing_belt_speed, grazing_map, hopf_belt_speed
 from sd_friction_env.physics.orbits.boundaries import GrazingBorder, HopfBorder
 from sd_friction_env.physics.sweeps import Engine, SweepError
+from tests.physics.test_own_laws import OwnStribeck
 
 CUBIC = OscillatorParameters(geometry="cubic")
 LINEAR = OscillatorParameters(geometry="linear")
 GAUSSIAN = OscillatorParameters(geometry="linear", friction="gaussian", mu_s=0.4, mu_k=0.2)
 DIRECT = {"v_b0": grazing_belt_speed, "v_b1": hopf_belt_speed}
-
-
-@friction_law
-class WithoutGradient(NamedTuple):
-    """Stribeck's law without derivatives by its numbers."""
-
-    mu_s: float
-    k1: float
-    k3: float
-
-    def coefficient(self, mode, v_rel):
-        return mode * self.mu_s - self.k1 * v_rel + self.k3 * (v_rel * v_rel * v_rel)
-
-    def slope(self, mode, v_rel):
-        return -self.k1 + 3.0 * self.k3 * (v_rel * v_rel)
-
-    def curvature(self, mode, v_rel):
-        return 6.0 * self.k3 * v_rel
-
-    def third_derivative(self, mode, v_rel):
-        return 6.0 * self.k3
 
 
 def curve_of(chart, curve, kind=None):
@@ -115,7 +94,7 @@ def test_regions_have_the_names_of_their_attractors():
 @pytest.mark.slow  # compiles its law
 def test_a_law_without_derivatives_gives_the_same_curves():
     k1, k3 = CUBIC.k1, CUBIC.k3
-    own = CUBIC.replace(friction=WithoutGradient(CUBIC.mu_s, k1, k3))
+    own = CUBIC.replace(friction=OwnStribeck(CUBIC.mu_s, k1, k3))
     chart = stability_chart(own, ("friction.k1", 0.9 * k1, 1.1 * k1), points=10)
     assert curve_of(chart, "v_b0")[0].size > 9
     values, speeds = curve_of(chart, "v_b0")

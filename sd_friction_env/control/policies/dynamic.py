@@ -7,15 +7,13 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env.control.policies.feedback import Feedback
+from sd_friction_env import kernel
+from sd_friction_env.control.policies.feedback import GAINS, Feedback
 from sd_friction_env.control.policies.follower import estimate_belt_speed
 from sd_friction_env.control.policies.policy import State, remembered
 from sd_friction_env.physics.parameters import checked_number
 
 _Floats = NDArray[np.float64]
-
-_GAINS = (-1e9, 1e9)
-_DIFFERENCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -82,9 +80,8 @@ class SoftBelt(SampledFeedback):
         """Return the controller of an environment, with its nominal mount; see :meth:`Feedback.from_env`."""
         nominal = getattr(getattr(env, "unwrapped", None), "nominal", None)
         if nominal is not None:
-            x, h = named.get("readings", Feedback.from_env(env).readings).x_equilibrium, _DIFFERENCE
-            slope = (nominal.restoring_force(x + h) - nominal.restoring_force(x - h)) / (2.0 * h)
-            named = {"mount_stiffness": slope} | named
+            x = named.get("readings", Feedback.from_env(env).readings).x_equilibrium
+            named = {"mount_stiffness": float(kernel.restoring_slope(nominal.plant, x))} | named
         return super().from_env(env, *arguments, **named)
 
     def _act(self, values: _Floats, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
@@ -113,7 +110,7 @@ class SuperTwisting(SampledFeedback):
     proportional: float
     integral: float
 
-    _ranges: ClassVar = {**SampledFeedback._ranges, **dict.fromkeys(("slope", "proportional", "integral"), _GAINS)}
+    _ranges: ClassVar = {**SampledFeedback._ranges, **dict.fromkeys(("slope", "proportional", "integral"), GAINS)}
     _needs_velocity = True
 
     def _act(self, values: _Floats, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:

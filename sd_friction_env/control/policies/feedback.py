@@ -13,7 +13,7 @@ from sd_friction_env.physics.parameters import OscillatorParameters, checked_num
 
 _Floats = NDArray[np.float64]
 _Starts = ArrayLike | None
-_GAINS = (-1e9, 1e9)
+GAINS = (-1e9, 1e9)
 
 
 def nearest_equilibrium(parameters: OscillatorParameters, x: float) -> float:
@@ -149,7 +149,7 @@ class LinearFeedback(Feedback):
     gains: tuple[float, ...]
     bias: float = 0.0
 
-    _ranges: ClassVar = {"bias": _GAINS}
+    _ranges: ClassVar = {"bias": GAINS}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -157,7 +157,7 @@ class LinearFeedback(Feedback):
         if len(self.gains) != len(names):
             raise ValueError(f"gains must be {len(names)} numbers, for {', '.join(names)}; got {self.gains!r}")
         pairs = zip(names, self.gains, strict=True)
-        gains = tuple(checked_number(f"gain for {name}", gain, *_GAINS) for name, gain in pairs)
+        gains = tuple(checked_number(f"gain for {name}", gain, *GAINS) for name, gain in pairs)
         object.__setattr__(self, "gains", gains)
 
     def _act(self, values: _Floats, state: State, starts: _Starts) -> tuple[_Floats, State]:
@@ -178,7 +178,7 @@ class VelocityFeedback(Feedback):
 
     gain: float
 
-    _ranges: ClassVar = {"gain": _GAINS}
+    _ranges: ClassVar = {"gain": GAINS}
     _needs_velocity = True
 
     def _act(self, values: _Floats, state: State, starts: _Starts) -> tuple[_Floats, State]:
@@ -210,7 +210,7 @@ class FilteredFeedback(Feedback):
     amplitude: float = 1.0
 
     _ranges: ClassVar = {
-        **dict.fromkeys(("x_gain", "v_gain", "bias"), _GAINS),
+        **dict.fromkeys(("x_gain", "v_gain", "bias"), GAINS),
         "pole": (0.0, 0.999),
         "amplitude": (0.0, 1.0),
     }
@@ -243,7 +243,7 @@ class DelayedFeedback(Feedback):
     gain: float
     delay: int
 
-    _ranges: ClassVar = {"gain": _GAINS, "delay": (1.0, 1000.0)}
+    _ranges: ClassVar = {"gain": GAINS, "delay": (1.0, 1000.0)}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -278,7 +278,7 @@ class SlidingMode(Feedback):
     layer: float
     amplitude: float = 1.0
 
-    _ranges: ClassVar = {"slope": _GAINS, "layer": (1e-6, 1e6), "amplitude": (-1.0, 1.0)}
+    _ranges: ClassVar = {"slope": GAINS, "layer": (1e-6, 1e6), "amplitude": (-1.0, 1.0)}
     _needs_velocity = True
 
     def _act(self, values: _Floats, state: State, starts: _Starts) -> tuple[_Floats, State]:

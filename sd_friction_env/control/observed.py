@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.control.observers import Belief, Observer
 from sd_friction_env.control.policies import Actions, Policy, State, ThresholdFollower
+from sd_friction_env.control.policies.lookahead import pick
+from sd_friction_env.control.policies.policy import as_taken
 from sd_friction_env.physics.parameters import checked_count
 
 _Floats = NDArray[np.float64]
@@ -34,7 +36,7 @@ class ObservedPolicy:
         own, others = (None, None) if state is None else (state[:3], state[3:] or None)
         belief, own = self.observer.correct(observation, own, episode_start)
         actions, others = self._decide(belief, others, episode_start)
-        actions = _taken(actions)
+        actions = as_taken(actions)
         return actions.astype(np.float32)[..., None], (*self.observer.advance(own, actions), *(others or ()))
 
     def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
@@ -91,7 +93,7 @@ class ObservedRollout(ObservedRule):
             object.__setattr__(self, name, checked_count(name, getattr(self, name), *bounds))
 
     def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
-        own = _taken(super()._decide(belief, state, starts)[0])
+        own = as_taken(super()._decide(belief, state, starts)[0])
         first = np.empty((*own.shape, self.candidates + 1))
         first[..., 0], first[..., 1:] = own, np.linspace(-1.0, 1.0, self.candidates)
         shares = (np.arange(min(self.guesses, belief.weights.shape[-1])) + 0.5) / self.guesses
@@ -107,10 +109,8 @@ class ObservedRollout(ObservedRule):
         for _ in range(self.horizon):
             now, rewards = self.observer.ensemble.step(now, parameters, actions)
             total += rewards
-            actions = _taken(self._follow(now, parameters))
-        best = np.argmax(np.nan_to_num(total, nan=-1e9).mean(axis=-2), axis=-1)
-        chosen: _Floats = np.take_along_axis(first, best[..., None], axis=-1)[..., 0]
-        return chosen, None
+            actions = as_taken(self._follow(now, parameters))
+        return pick(first, np.argmax(np.nan_to_num(total, nan=-1e9).mean(axis=-2), axis=-1)), None
 
 
 @dataclass(frozen=True)
@@ -134,8 +134,3 @@ class ObservedNetwork(ObservedPolicy):
         observation = np.clip(np.stack(seen, axis=-1), -limit, limit).astype(np.float32)
         actions, state = self.policy.predict(observation, state, starts)
         return np.asarray(actions, np.float64)[..., 0], state
-
-
-def _taken(actions: _Floats) -> _Floats:
-    """Return actions as the environment takes them: clipped, in single precision."""
-    return np.clip(actions, -1.0, 1.0).astype(np.float32).astype(np.float64)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.control.policies.feedback import Feedback, Readings
 from sd_friction_env.control.policies.lookahead import Model, RolloutPolicy
-from sd_friction_env.control.policies.policy import State, broadcast_starts, checked_memory, remembered
+from sd_friction_env.control.policies.policy import State, as_taken, broadcast_starts, checked_memory, remembered
 
 _Floats = NDArray[np.float64]
 
@@ -204,10 +204,9 @@ class ObservingFollower(ThresholdFollower):
         steps = [model + np.stack([gain * difference for gain in corrections], axis=-1)]
         for i in range(self.sensor_delay):
             steps.append(self._advance(steps[-1], actions[..., i]))
-        # As the environment takes it: clipped, in single precision.
         now = steps[-1]
         wanted = self.rollout.best_actions(now) if self.rollout else self.follow(now[..., 1], self.belt_speed)
-        action = np.clip(wanted, -1.0, 1.0).astype(np.float32).astype(float)
+        action = as_taken(wanted)
         actions = np.concatenate([actions, action[..., None]], axis=-1)
         if not self.sensor_delay:
             steps.append(self._advance(steps[0], action))

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env import kernel
 from sd_friction_env.control.policies.feedback import Feedback
-from sd_friction_env.control.policies.policy import State
+from sd_friction_env.control.policies.policy import State, as_taken
 from sd_friction_env.environments.jacobian import control_jacobians, control_steps
 from sd_friction_env.physics.parameters import OscillatorParameters, checked_count
 
@@ -133,7 +133,7 @@ class LookAhead(Feedback):
         if values.shape[-1] > 2:
             values[..., 2] = (states[..., 2] - self.model.parameters.belt_speed) / self.readings.authority
         action, _ = self.base._act(values, None, None)
-        return np.clip(action, -1.0, 1.0).astype(np.float32).astype(np.float64)
+        return as_taken(action)
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,11 @@ class ZeroPolicy(ConstantPolicy):
         super().__init__(0.0)
 
 
+def as_taken(actions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return actions as the environment takes them: clipped, in single precision."""
+    return np.clip(actions, -1.0, 1.0).astype(np.float32).astype(np.float64)
+
+
 def checked_memory(state: tuple[NDArray[Any], ...], *shapes: tuple[int, ...]) -> tuple[NDArray[Any], ...]:
     """Return a policy's memory after checking its shapes.
 

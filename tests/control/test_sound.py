@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.io import wavfile
 
-from sd_friction_env import OscillatorParameters, limit_cycle
+from sd_friction_env import OscillatorParameters, limit_cycle, simulate
 from sd_friction_env.cli.main import main
 from sd_friction_env.control import sound
-from sd_friction_env.control.policies import ZeroPolicy, threshold_follower
+from sd_friction_env.control.policies import ConstantPolicy, ZeroPolicy, threshold_follower
 from sd_friction_env.learning import evaluation
 from sd_friction_env.physics import signals
 from sd_friction_env.physics.orbits import OrbitError
@@ -52,6 +52,17 @@ def test_without_control_the_second_part_sounds_as_the_first():
     before, after = sound.squeal(env, ZeroPolicy(), pitch, seconds=0.1, rate=16_000)
     assert np.std(after) == pytest.approx(np.std(before), rel=0.01)
     assert signals.harmonics(after, 1 / 16_000, count=1)["frequency"][0] == pytest.approx(440.0, rel=1e-3)
+
+
+def test_the_sound_under_control_is_the_motion_on_the_belt_as_it_moves():
+    env, plant, dt = evaluation.make_env(BELT), OscillatorParameters(), 0.0125
+    times, velocities = sound._controlled(env, ConstantPolicy(1.0), (0.7, 0.1), 3.0, dt)
+    accelerations = np.zeros(40)
+    accelerations[:2] = 0.5  # from 0.2 to 0.3, at the belt's greatest acceleration
+    motion = simulate(plant, 0.7, 0.1, 4.0, dt=dt, belt_acceleration=accelerations, hold=0.1)
+    count = len(times)
+    np.testing.assert_allclose(times, motion.t[:count], atol=1e-12)
+    np.testing.assert_allclose(velocities, motion.v[:count], atol=1e-7)  # actions are in single precision
 
 
 def test_what_cannot_be_heard_is_refused(tmp_path):

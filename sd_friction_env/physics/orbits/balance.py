@@ -216,10 +216,9 @@ class SlipSlopes(NamedTuple):
 
 def slip_slopes(plant: Any, mode: int, x: float, v_rel: float) -> SlipSlopes:
     """Return how the acceleration of an unexcited plant changes in slip at x and a relative velocity."""
-    stiffness = kernel.restoring_slope(plant, x) + plant.friction.coefficient(mode, v_rel) * kernel.normal_slope(
-        plant, x
-    )
-    grip = plant.friction.slope(mode, v_rel) * kernel.normal_force(plant, x)
+    mu, slope = plant.friction.coefficient(mode, v_rel), plant.friction.slope(mode, v_rel)
+    stiffness = kernel.restoring_slope(plant, x) + mu * kernel.normal_slope(plant, x)
+    grip = slope * kernel.normal_force(plant, x)
     return SlipSlopes(float(stiffness), float(2.0 * plant.beta + grip), float(grip))
 
 

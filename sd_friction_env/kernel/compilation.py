@@ -6,7 +6,7 @@ of a law that a function was compiled for renews that. numba's cache trusts its 
 every start, a crash or a wrong number, and of two processes that compile at once one can overwrite the other's code
 under a name that both then read. Where no folder can be written, it refuses to define a function at all. Here every
 file ends with a digest and every entry names the source and the signature it was compiled from; what does not fit is
-compiled anew. No fault of the cache raises.
+compiled anew. No fault of the cache raises. Names are unique to a process: numba takes constants by name.
 """
 
 import contextlib
@@ -14,6 +14,7 @@ import functools
 import hashlib
 import inspect
 import io
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -173,13 +174,13 @@ class _Cache(FunctionCache):
             filename_base=f"{self._impl.filename_base}.checked",
             source_stamp=(_SOURCES, _digest_of_own(Path(inspect.getfile(py_func)))),
         )
-        self._function = py_func
+        self._function, self._name = py_func, f"{py_func.__module__}.{py_func.__qualname__}"
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         function = self._function
         code = hashlib.sha256(function.__code__.co_code).hexdigest()
         laws = tuple(sorted(_identity(law) for law in _laws_of(function, sig)))
-        return f"{function.__module__}.{function.__qualname__} {code} {sig}", codegen.magic_tuple(), laws
+        return f"{self._name} {code} {sig}", codegen.magic_tuple(), laws
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         if not _is_kept(self._function, sig):
@@ -233,6 +234,27 @@ _boxers.functions.update(dict.fromkeys((types.NamedTuple, types.NamedUniTuple), 
 _SECONDS_PER_BYTE = 0.0003  # of bytecode, on a core of 2020
 _PATIENCE = 3.0  # seconds: what takes less is not worth a line
 _functions: set[Callable[..., Any]] = set()  # that have one of the decorators below
+
+
+def _name_by_process(*functions: Callable[..., Any]) -> None:
+    """Make the names of functions unique to this process.
+
+    numba finds the constants of compiled code (the class or the array type that it returns) by qualified name and a
+    count in the process that compiled it. Code of two processes could agree in both, and take the other's constants.
+    """
+    for function in functions:
+        function.__qualname__ = f"{function.__qualname__.partition('@')[0]}@{_process}"
+
+
+def _after_fork() -> None:
+    global _process  # noqa: PLW0603
+    _process = os.urandom(4).hex()
+    _name_by_process(*_functions)
+
+
+_process = os.urandom(4).hex()
+if hasattr(os, "register_at_fork"):  # Windows has no fork
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 class _Announcer(event.Listener):
@@ -290,6 +312,7 @@ def _decorator(*, cached: bool = True, **options: Any) -> Callable[[Callable[...
             with contextlib.suppress(Exception):  # no folder can be written: compiled in every process
                 if cached:
                     dispatcher._cache = _Cache(function)  # type: ignore[attr-defined]
+            _name_by_process(function)
         return dispatcher
 
     return decorate

@@ -282,6 +282,62 @@ def test_the_doctor_works_with_damaged_files_and_names_the_folder_in_use(tmp_pat
     assert str(folder) in error
 
 
+MAKERS = """
+import sys
+from typing import NamedTuple
+from sd_friction_env.kernel.compilation import entry, reader
+
+
+class Push(NamedTuple):
+    force: float
+
+
+class Place(NamedTuple):
+    x: float
+
+
+def maker(kind):
+    source = f"def read():\\n    return {len(kind.__name__)}.0\\n"
+    names = {}
+    exec(source, names)
+    read = reader(names["read"], source, [kind], 0)
+
+    @entry
+    def value(x):
+        return kind(read() * x)
+
+    return value
+
+
+def results(names):
+    kept = [maker(globals()[name]) for name in names]  # one process keeps both
+    return [value(2.0) for value in kept]
+"""
+ASK_MAKERS = "import sys, makers; print(makers.results(sys.argv[1:]))"
+ASK_FORKED = """
+import multiprocessing, sys, makers
+child = multiprocessing.get_context("fork").Process(target=makers.results, args=(sys.argv[1:],))
+child.start()
+child.join()
+"""
+
+
+@pytest.mark.parametrize("before", [["Push", "Place"], ["Push", "Push Place"], ["forked Push", "forked Place"]])
+def test_code_that_two_processes_compiled_under_one_name_keeps_its_own_constants(before, tmp_path):
+    (tmp_path / "makers.py").write_text(MAKERS)
+
+    def ask(*names):
+        code, names = (ASK_FORKED, names[1:]) if names[0] == "forked" else (ASK_MAKERS, names)
+        out, error = run(["-c", code, *names], tmp_path, NUMBA_CACHE_DIR="").communicate(timeout=300)
+        assert error == "", error
+        return out.strip()
+
+    for names in before:
+        ask(*names.split())
+    assert ask("Push", "Place") == "[Push(force=8.0), Place(x=10.0)]"
+    assert ask("Place", "Push") == "[Place(x=10.0), Push(force=8.0)]"
+
+
 OWN = """
 from typing import NamedTuple
 from sd_friction_env import friction_law

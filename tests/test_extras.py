@@ -40,6 +40,7 @@ except ImportError as error:
         ("stable_baselines3", "from sd_friction_env import SDFrictionVecEnv", "train"),
         ("torch,stable_baselines3", "from sd_friction_env import AnnealedExploration", "train"),
         ("stable_baselines3", "import sd_friction_env.environments.sb3", "train"),
+        ("pygame", "from sd_friction_env.pictures.renderer import Renderer", "render"),
         ("torch", "from sd_friction_env import torch_step; torch_step()", "torch"),
         ("jax", "from sd_friction_env import jax_step; jax_step()", "jax"),
         (

@@ -23,7 +23,7 @@ from sd_friction_env.environments.ids import TASKS, environment_id
 from sd_friction_env.learning import evaluation
 from sd_friction_env.physics import signals
 from sd_friction_env.physics.parameters import checked_number
-from sd_friction_env.pictures.renderer import checked_size
+from sd_friction_env.pictures.scene import checked_size
 
 
 def _explore(options: argparse.Namespace) -> int:

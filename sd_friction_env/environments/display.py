@@ -10,8 +10,8 @@ from sd_friction_env.environments.task import Task
 from sd_friction_env.physics.orbits import stick_intervals
 from sd_friction_env.physics.parameters import checked_choice
 from sd_friction_env.physics.simulation import amplitude
+from sd_friction_env.pictures.scene import RENDER_MODES, Scene
 
-RENDER_MODES = ("human", "rgb_array")
 FRAMES_PER_SECOND = 30
 READOUT_INTERVALS = 100  # window of the amplitude and stick readouts, in control intervals
 
@@ -43,7 +43,6 @@ class Display:
     def draw(self, state: EnvState, title: str) -> Any:
         """Draw a state; return an array (height, width, 3), uint8, in mode "rgb_array"."""
         from sd_friction_env.pictures.renderer import Renderer
-        from sd_friction_env.pictures.scene import Scene
 
         if self._renderer is None:
             self._renderer = Renderer(self._mode, *self._size, fps=FRAMES_PER_SECOND)

@@ -11,13 +11,14 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from sd_friction_env.environments.display import RENDER_MODES, Display
+from sd_friction_env.environments.display import Display
 from sd_friction_env.environments.episodes import Episodes
 from sd_friction_env.environments.limits import LengthInSpec
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.environments.states import EnvState, check_state
 from sd_friction_env.environments.task import IntegerArray
 from sd_friction_env.physics.parameters import brief_repr, checked_choice, checked_count
+from sd_friction_env.pictures.scene import RENDER_MODES
 
 _STATE_METHODS = ("reset", "set_state", "step")  # of the single environment; they need or change a state
 _MOST_RENDERED = 16

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sd_friction_env import kernel
-from sd_friction_env.environments.display import FRAMES_PER_SECOND, RENDER_MODES, Display
+from sd_friction_env.environments.display import FRAMES_PER_SECOND, Display
 from sd_friction_env.environments.info import PLAIN_STATISTICS, episode_statistics, new_step_info, numbers_of
 from sd_friction_env.environments.limits import LengthInSpec, time_limits
 from sd_friction_env.environments.options import (
@@ -22,7 +22,7 @@ from sd_friction_env.environments.options import (
 from sd_friction_env.environments.states import EnvState, check_state, read_state, write_state
 from sd_friction_env.environments.task import Task, drifted, rig_arguments, steps_before_last_quarter
 from sd_friction_env.physics.parameters import OscillatorParameters, plant_of
-from sd_friction_env.pictures.renderer import checked_size
+from sd_friction_env.pictures.scene import RENDER_MODES, checked_size
 
 RewardFunction = Callable[[Mapping[str, Any]], float]
 

@@ -4,17 +4,19 @@ Coordinates are floats throughout: a motion rounded to whole pixels would trembl
 """
 
 import math
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sd_friction_env.extras import extra
 from sd_friction_env.pictures.scene import Box, Layout, Limits, Point, Scene, View
 
-if TYPE_CHECKING:
+os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # or pygame greets on standard output
+with extra("render"):
     import pygame
 
 Color = tuple[int, int, int]
@@ -62,10 +64,8 @@ class Lettering:
         self._fonts: dict[int, pygame.font.Font] = {}
         self._texts: dict[tuple[str, int, Color], pygame.Surface] = {}
 
-    def image(self, text: str, size: float, color: Color) -> "pygame.Surface":
+    def image(self, text: str, size: float, color: Color) -> pygame.Surface:
         """Return a text's picture; letters are at least 11 pixels high."""
-        import pygame
-
         key = (text, max(11, round(size)), color)
         if key not in self._texts:
             if len(self._texts) > 500:
@@ -83,15 +83,13 @@ class Lettering:
 class Canvas:
     """A surface with what is drawn on it."""
 
-    surface: "pygame.Surface"
+    surface: pygame.Surface
     lettering: Lettering
 
     def write(
         self, text: str, at: Point, size: float, color: Color, anchor: Anchor = "midleft", turned: bool = False
     ) -> float:
         """Write a text and return its width."""
-        import pygame
-
         image = self.lettering.image(text, size, color)
         if turned:
             image = pygame.transform.rotate(image, 90)
@@ -101,8 +99,6 @@ class Canvas:
 
     def stroke(self, color: Color, points: NDArray[np.float64] | Sequence[Point], width: float) -> None:
         """Draw a smooth line of any width: anti-aliased lines of one pixel, side by side."""
-        import pygame
-
         spread = max(width - 1.0, 0.0) / 2
         count = math.ceil(4.0 * spread) + 1
         offsets = [spread * (2.0 * k / max(count - 1, 1) - 1.0) for k in range(count)]
@@ -142,8 +138,6 @@ class Canvas:
 
     def panel(self, box: Box, radius: float) -> None:
         """Draw an empty panel: white, with a thin edge and rounded corners."""
-        import pygame
-
         area = pygame.Rect(box.ltwh)
         inner = area.inflate(-2, -2)
         pygame.draw.rect(self.surface, LINE, area)
@@ -174,27 +168,19 @@ class Canvas:
 class CloseUp:
     """A patch of the surface drawn enlarged and then averaged, which gives any shape smooth edges."""
 
-    def __init__(self, surface: "pygame.Surface", box: Box) -> None:
-        import pygame
-
+    def __init__(self, surface: pygame.Surface, box: Box) -> None:
         corner = (math.floor(box.left) - 1, math.floor(box.top) - 1)
         area = pygame.Rect(corner, (math.ceil(box.right) + 1 - corner[0], math.ceil(box.bottom) + 1 - corner[1]))
         self._surface = surface
         self._area = area.clip(surface.get_clip())
 
     def __enter__(self) -> Self:
-        import pygame
-
         size = (self._area.width * _ENLARGED, self._area.height * _ENLARGED)
         patch = self._surface.subsurface(self._area) if self._area.width and self._area.height else None
         self._big = pygame.transform.scale(patch, size) if patch else pygame.Surface((1, 1), 0, 32)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        import pygame
-
+    def __exit__(self, *_: object) -> None:
         if self._area.width and self._area.height:
             self._surface.blit(pygame.transform.smoothscale(self._big, self._area.size), self._area)
 
@@ -203,8 +189,6 @@ class CloseUp:
 
     def polygon(self, color: Color, points: Iterable[Point]) -> None:
         """Fill a polygon."""
-        import pygame
-
         pygame.draw.polygon(self._big, color, [self._inside(point) for point in points])
 
     def square(self, color: Color, at: Point, half: float) -> None:
@@ -215,14 +199,10 @@ class CloseUp:
 
     def circle(self, color: Color, center: Point, radius: float) -> None:
         """Fill a circle."""
-        import pygame
-
         pygame.draw.circle(self._big, color, self._inside(center), radius * _ENLARGED)
 
     def rounded(self, color: Color, box: Box, radius: float) -> None:
         """Fill a rectangle with rounded corners."""
-        import pygame
-
         left, top = self._inside((box.left, box.top))
         right, bottom = self._inside((box.right, box.bottom))
         rect = pygame.Rect(round(left), round(top), round(right) - round(left), round(bottom) - round(top))

@@ -209,8 +209,7 @@ def draw_before_and_after(histories: Mapping[str, Trajectory], switched_on: floa
             axis.axvspan(switched_on, t[-1], color="0.95", zorder=0)
             axis.plot(t[before], values[before], color=GREY, linewidth=1.4)
             axis.plot(t[~before], values[~before], color=GREEN, linewidth=1.4)
-            axis.set_xlabel(r"time $\tau$")
-            axis.set_ylabel(label)
+            axis.set(xlabel=r"time $\tau$", ylabel=label)
             axis.margins(x=0)
         row[0].set_title(name, loc="left", fontsize=10)
         row[1].plot(t, belt, color=BLACK, linewidth=1.0, linestyle=(0, (4, 2)), label=r"belt $v_b$")
@@ -218,8 +217,7 @@ def draw_before_and_after(histories: Mapping[str, Trajectory], switched_on: floa
         row[2].plot(x[before], v[before], color=GREY, linewidth=1.2, label="passive")
         row[2].plot(x[~before], v[~before], color=GREEN, linewidth=1.2, label="controlled")
         row[2].plot(x[-1:], v[-1:], marker="o", color=BLACK, markersize=5, linestyle="none", label="end")
-        row[2].set_xlabel(r"$x$")
-        row[2].set_ylabel(r"$\dot x$")
+        row[2].set(xlabel=r"$x$", ylabel=r"$\dot x$")
         row[2].legend(loc="lower left", fontsize=8, frameon=False)
     return figure
 
@@ -255,8 +253,7 @@ def draw_amplitude_table(table: Table, members: Sequence[Mapping[str, Any]]) -> 
             mark_critical_speeds(axis, *(speed if low <= speed <= high else np.nan for speed in speeds))
         else:
             draw_family_member(axis, curve, "amplitude", label, FAMILY[i % len(FAMILY)])
-    axis.set_xlabel(r"belt speed $v_b$")
-    axis.set_ylabel(r"amplitude $A$")
+    axis.set(xlabel=r"belt speed $v_b$", ylabel=r"amplitude $A$")
     if len(members) > 1 and "well" not in table:
         axis.set_title("solid: stick-slip; dashed: pure slip; dotted: steady slip", fontsize=8, loc="left")
     axis.set_ylim(bottom=-0.02 * axis.get_ylim()[1])  # steady slip lies on zero
@@ -273,8 +270,7 @@ def draw_history(history: Trajectory) -> "Figure":
     for axis, values, label in ((axes[0, 0], history.x, "$x$"), (axes[0, 1], history.v, r"$\dot x$")):
         axis.plot(history.t, values, color=VERMILION, linewidth=1.4, label="slip")
         axis.plot(history.t, np.where(stuck, values, np.nan), color=BLUE, linewidth=2.6, label="stick")
-        axis.set_xlabel(r"time $\tau$")
-        axis.set_ylabel(label)
+        axis.set(xlabel=r"time $\tau$", ylabel=label)
         axis.margins(x=0)
     draw_portrait(axes[0, 2], history.x, history.v, stuck)
     axes[0, 0].legend(fontsize=8, frameon=False)
@@ -288,8 +284,7 @@ def draw_portrait(
     """Draw a phase portrait, its stick phases marked."""
     axis.plot(x, v, color=VERMILION, linewidth=linewidth, label="slip")
     axis.plot(np.where(stuck, x, np.nan), v, color=BLUE, linewidth=2.6, label="stick")
-    axis.set_xlabel("$x$")
-    axis.set_ylabel(r"$\dot x$")
+    axis.set(xlabel="$x$", ylabel=r"$\dot x$")
 
 
 def _draw_dots(axis: "Axes", x: Any, y: Any, size: float, color: str, label: str) -> None:
@@ -311,15 +306,9 @@ def draw_basins(axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], fo
     Args:
         x, v: axes of the grid, shapes (n,) and (m,). found: its basins, labels of shape (m, n).
     """
-    from matplotlib.colors import BoundaryNorm, ListedColormap
-    from matplotlib.patches import Patch
-
-    shades = ["#F5F5F5", "#BBBBBB", "#A6CEE3", "#FDD9B5", "#B9E3C6", "#DDC7E8", "#F7EFA5"]
-    names = ["undecided", "contact lost", *map(attractor_name, found.attractors)]
-    axis.grid(visible=False)
-    colours = [shades[i % len(shades)] for i in range(len(names))]
-    norm = BoundaryNorm(np.arange(-2.5, len(found.attractors)), len(names))
-    axis.pcolormesh(x, v, found.labels, cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True)
+    names = [*map(attractor_name, found.attractors)]
+    shares = [found.fraction(label)[0] for label in range(-2, len(names))]
+    _draw_labels(axis, x, v, found.labels, names, shares, lost="#BBBBBB", height=1.17)
     lines = ("-", (0, (4, 1.5)), (0, (1, 1)), "-.")
     for i, cycle in enumerate(found.attractors):
         states = np.array([cycle.state(phase) for phase in np.linspace(0.0, 1.0, 400)])
@@ -327,17 +316,44 @@ def draw_basins(axis: "Axes", x: NDArray[np.float64], v: NDArray[np.float64], fo
         if cycle.amplitude == 0.0:
             axis.plot(*states[0], marker="o", color=BLACK)
     axis.axhline(found.parameters.belt_speed, color="0.45", linewidth=0.8, linestyle=":")
-    axis.set_xlim(x[0], x[-1])
-    axis.set_ylim(v[0], v[-1])
-    axis.set_xlabel("start $x$")
-    axis.set_ylabel(r"start $\dot x$")
-    patches = []
-    for label in range(-2, len(found.attractors)):
-        share = found.fraction(label)[0]
-        if share > 0.0:
-            text = f"{names[label + 2]}, {100.0 * share:.1f}%"
-            patches.append(Patch(facecolor=colours[label + 2], edgecolor="0.6", label=text))
-    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.17), ncols=4, frameon=False)
+
+
+@house_style()
+def draw_forced_basins(axis: "Axes", found: ForcedBasins) -> None:
+    """Draw a grid of forced basins with the section points of the periodic attractors on it."""
+    names = [f"period {orbit.multiple}" for orbit in found.attractors] + ["chaos"] * (found.chaos is not None)
+    shares = [found.fraction(label) for label in range(-2, len(names))]
+    _draw_labels(axis, found.x, found.v, found.labels, names, shares, lost=GREY, height=1.12)
+    for orbit, marker in zip(found.attractors, "osD^v<>ph*" * len(found.attractors), strict=False):
+        style: dict[str, Any] = {"linestyle": "none", "markersize": 5.5, "markeredgecolor": "white", "color": BLACK}
+        axis.plot(*orbit.points.T, marker=marker, **style)
+    axis.axhline(found.parameters.belt_speed, color="0.45", linewidth=0.8, linestyle=":")
+
+
+def _draw_labels(
+    axis: "Axes", x: Any, v: Any, labels: Any, names: list[str], shares: list[float], *, lost: str, height: float
+) -> None:
+    """Draw the labels of a grid of starts, and a legend ``height`` axes above of those that have a share.
+
+    Args:
+        names: of the labels from 0 on. shares: of the labels from -2 on. lost: colour of lost contact.
+    """
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patches import Patch
+
+    names = ["undecided", "contact lost", *names]
+    shades = ["#F5F5F5", lost, "#A6CEE3", "#FDD9B5", "#B9E3C6", "#DDC7E8", "#F7EFA5"]
+    colours = [shades[i % len(shades)] for i in range(len(names))]
+    norm = BoundaryNorm(np.arange(-2.5, len(names) - 2), len(names))
+    axis.grid(visible=False)
+    axis.pcolormesh(x, v, labels, cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True)
+    axis.set(xlim=(x[0], x[-1]), ylim=(v[0], v[-1]), xlabel="start $x$", ylabel=r"start $\dot x$")
+    patches = [
+        Patch(facecolor=colour, edgecolor="0.6", label=f"{name}, {100.0 * share:.1f}%")
+        for name, colour, share in zip(names, colours, shares, strict=True)
+        if share > 0.0
+    ]
+    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, height), ncols=4, frameon=False)
 
 
 @house_style()
@@ -350,8 +366,7 @@ def draw_bifurcation(axis: "Axes", diagram: Table) -> None:
         part = diagram["direction"] == way
         if part.any():
             _draw_dots(axis, diagram["value"][part], diagram["x"][part], share * size, color, way)
-    axis.set_xlabel(label_of(diagram.metadata["swept"]))
-    axis.set_ylabel("$x$ on the section")
+    axis.set(xlabel=label_of(diagram.metadata["swept"]), ylabel="$x$ on the section")
     axis.legend(fontsize=8, frameon=False, loc="best")
 
 
@@ -380,8 +395,7 @@ def draw_chart(axis: "Axes", chart: Table) -> None:
             handles[kind] = axis.plot(over[part], speeds[part], marker=marker, **mark)[0]
     axis.set_ylim(bottom=0.0)
     axis.margins(x=0.0, y=0.0)
-    axis.set_xlabel(label_of(name))
-    axis.set_ylabel(label_of("belt_speed"))
+    axis.set(xlabel=label_of(name), ylabel=label_of("belt_speed"))
     axis.legend(handles=list(handles.values()), fontsize=8, loc="best")
 
 
@@ -394,8 +408,7 @@ def draw_response(axis: "Axes", curve: Table) -> None:
         if part.any():
             _draw_dots(axis, curve["value"][part], curve["amplitude"][part], size, WAYS[way], way)
             angles.plot(curve["value"][part], curve["phase"][part], color=WAYS[way], linewidth=1.0, linestyle=":")
-    axis.set_xlabel(label_of(curve.metadata["swept"]))
-    axis.set_ylabel("amplitude")
+    axis.set(xlabel=label_of(curve.metadata["swept"]), ylabel="amplitude")
     angles.set_ylabel("phase (dotted), rad")
     axis.legend(fontsize=8, frameon=False, loc="best")
 
@@ -421,37 +434,5 @@ def draw_section(axis: "Axes", section: Table) -> None:
     stuck = section["mode"] == 0
     for part, color, label in ((~stuck, VERMILION, "slip"), (stuck, BLUE, "stick")):
         _draw_dots(axis, section["x"][part], section["v"][part], 2.2, color, label)
-    axis.set_xlabel("$x$")
-    axis.set_ylabel(r"$\dot x$")
+    axis.set(xlabel="$x$", ylabel=r"$\dot x$")
     axis.legend(fontsize=8, frameon=False)
-
-
-@house_style()
-def draw_forced_basins(axis: "Axes", found: ForcedBasins) -> None:
-    """Draw a grid of forced basins with the section points of the periodic attractors on it."""
-    from matplotlib.colors import BoundaryNorm, ListedColormap
-    from matplotlib.patches import Patch
-
-    shades = ["#F5F5F5", "#8A8A8A", "#A6CEE3", "#FDD9B5", "#B9E3C6", "#DDC7E8", "#F7EFA5"]
-    names = ["undecided", "contact lost", *(f"period {orbit.multiple}" for orbit in found.attractors)]
-    names += ["chaos"] if found.chaos is not None else []
-    colours = [shades[i % len(shades)] for i in range(len(names))]
-    norm = BoundaryNorm(np.arange(-2.5, len(names) - 2), len(names))
-    axis.grid(visible=False)
-    axis.pcolormesh(
-        found.x, found.v, found.labels, cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True
-    )
-    for orbit, marker in zip(found.attractors, "osD^v<>ph*" * len(found.attractors), strict=False):
-        style: dict[str, Any] = {"linestyle": "none", "markersize": 5.5, "markeredgecolor": "white", "color": BLACK}
-        axis.plot(*orbit.points.T, marker=marker, **style)
-    axis.axhline(found.parameters.belt_speed, color="0.45", linewidth=0.8, linestyle=":")
-    axis.set_xlim(found.x[0], found.x[-1])
-    axis.set_ylim(found.v[0], found.v[-1])
-    axis.set_xlabel("start $x$")
-    axis.set_ylabel(r"start $\dot x$")
-    patches = [
-        Patch(facecolor=colours[i], edgecolor="0.6", label=f"{names[i]}, {100.0 * found.fraction(i - 2):.1f}%")
-        for i in range(len(names))
-        if found.fraction(i - 2) > 0.0
-    ]
-    axis.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=4, frameon=False)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sd_friction_env.extras import extra
 from sd_friction_env.pictures.canvas import (
     BLUE,
     GRID,
@@ -22,14 +23,15 @@ from sd_friction_env.pictures.canvas import (
 )
 from sd_friction_env.pictures.scene import Box
 
+with extra("render"):
+    import pygame
+
 TRAIL_POINTS = 300
 FADES = 12  # steps in which the trail fades
 
 
 def draw_axes(frame: Frame) -> None:
     """Draw what stays put while the view does: title, grid and numbers."""
-    import pygame
-
     c, layout, view = frame.canvas, frame.layout, frame.view
     u, plot, size = layout.unit, layout.plot, 17 * layout.unit
     thin = max(1, round(u))

@@ -1,29 +1,23 @@
 """Pictures of the oscillator: spring, mass and moving belt beside the phase portrait; needs pygame-ce."""
 
 import math
-import operator
-import os
 from collections import deque
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sd_friction_env.extras import extra
-from sd_friction_env.physics.parameters import brief_repr
+from sd_friction_env.physics.parameters import checked_choice
 from sd_friction_env.pictures.canvas import GROUND, Canvas, Frame, Lettering
 from sd_friction_env.pictures.gauges import draw_captions, draw_readouts
 from sd_friction_env.pictures.mechanism import draw_fixtures, draw_mechanism
 from sd_friction_env.pictures.portrait import TRAIL_POINTS, draw_axes, draw_portrait
-from sd_friction_env.pictures.scene import Layout, Limits, Scene, View
+from sd_friction_env.pictures.scene import HEIGHTS, RENDER_MODES, WIDTHS, Layout, Scene, View, checked_whole
 
-if TYPE_CHECKING:
-    import pygame
+with extra("render"):
+    import pygame.font
 
-RENDER_MODES = ("human", "rgb_array")
-WIDTHS = (240, 7680)
-HEIGHTS = (135, 4320)
 RATES = (1, 1000)
 _SURFACES = ("_window", "_clock", "_canvas", "_backdrop", "_backdrop_key")
 
@@ -35,40 +29,24 @@ class Renderer:
         render_mode: "human" or "rgb_array".
         width, height: of the frame in pixels; the window can be resized.
         fps: frames a second that the window keeps to.
-        x_limits, v_limits: (low, high) of the axes. Without them they fit the motion: they grow as it needs and start
-            afresh with :meth:`clear_trail`.
+
+    Attributes:
+        dismissed: whether the user closed the window; drawing then does nothing more.
+
+    The axes fit the motion: they grow as it needs and start afresh with :meth:`clear_trail`.
 
     Raises:
-        ImportError: if pygame is not installed.
         ValueError: if an argument is not as said above.
     """
 
-    def __init__(
-        self,
-        render_mode: str,
-        width: int = 960,
-        height: int = 540,
-        fps: int = 30,
-        x_limits: Limits | None = None,
-        v_limits: Limits | None = None,
-    ) -> None:
-        if render_mode not in RENDER_MODES:
-            raise ValueError(f"render_mode must be one of {', '.join(map(repr, RENDER_MODES))}, got {render_mode!r}")
-        self.render_mode = render_mode
-        self.width = _checked_whole("width", width, WIDTHS)
-        self.height = _checked_whole("height", height, HEIGHTS)
-        self.fps = _checked_whole("fps", fps, RATES)
-        self.x_limits = _checked_limits("x_limits", x_limits)
-        self.v_limits = _checked_limits("v_limits", v_limits)
-        self._dismissed = False
+    def __init__(self, render_mode: str, width: int = 960, height: int = 540, fps: int = 30) -> None:
+        self.render_mode = checked_choice("render_mode", render_mode, RENDER_MODES)
+        self.width = checked_whole("width", width, WIDTHS)
+        self.height = checked_whole("height", height, HEIGHTS)
+        self.fps = checked_whole("fps", fps, RATES)
+        self.dismissed = False
         self._drop_surfaces()
         self.clear_trail()
-        _require_pygame()
-
-    @property
-    def dismissed(self) -> bool:
-        """Whether the user closed the window; drawing then does nothing more."""
-        return self._dismissed
 
     def clear_trail(self) -> None:
         """Forget the motion so far: call it when an episode begins."""
@@ -86,18 +64,13 @@ class Renderer:
         for name in ("time", "x", "v", "v_belt", "belt_travel"):
             if not math.isfinite(getattr(scene, name)):
                 raise ValueError(f"scene.{name} must be a finite number, got {getattr(scene, name)!r}")
-        _require_pygame()
-        import pygame
-
+        pygame.font.init()  # needs no display; does nothing the second time
         if self.render_mode == "human":
-            if self._dismissed:
-                return None
             window = self._opened_window()
-            if window is None:
-                return None
-            window.blit(self._painted(scene, window.get_size()), (0, 0))
-            pygame.display.flip()
-            self._clock.tick(self.fps)
+            if window is not None:
+                window.blit(self._painted(scene, window.get_size()), (0, 0))
+                pygame.display.flip()
+                self._clock.tick(self.fps)
             return None
         painted = self._painted(scene, (self.width, self.height))
         # A surface on the array's own memory: SDL's conversion is several times faster than NumPy's strided copy.
@@ -108,8 +81,6 @@ class Renderer:
     def close(self) -> None:
         """Close the window, if there is one, and let go of the surfaces."""
         if self._window is not None:
-            import pygame
-
             pygame.display.quit()
         self._drop_surfaces()
 
@@ -128,10 +99,10 @@ class Renderer:
         self._backdrop: pygame.Surface | None = None
         self._backdrop_key: object = None
 
-    def _opened_window(self) -> "pygame.Surface | None":
+    def _opened_window(self) -> pygame.Surface | None:
         """Return the window after its events, or None once the user has closed it."""
-        import pygame
-
+        if self.dismissed:
+            return None
         if self._window is None:
             try:
                 pygame.display.init()
@@ -145,16 +116,14 @@ class Renderer:
             self._clock = pygame.time.Clock()
         for event in pygame.event.get():
             if event.type == pygame.QUIT:
-                self._dismissed = True
-        if self._dismissed:
+                self.dismissed = True
+        if self.dismissed:
             self.close()
             return None
         self._window = pygame.display.get_surface()  # another one after a resize
         return self._window
 
-    def _painted(self, scene: Scene, size: tuple[int, int]) -> "pygame.Surface":
-        import pygame
-
+    def _painted(self, scene: Scene, size: tuple[int, int]) -> pygame.Surface:
         size = (max(size[0], WIDTHS[0]), max(size[1], HEIGHTS[0]))
         if self._canvas is None or self._canvas.surface.get_size() != size:
             # 32 bits without alpha need no display to convert to.
@@ -162,7 +131,7 @@ class Renderer:
             self._backdrop = None
         self._remember(scene)
         layout = Layout.of(size)
-        view = self._view = View.of(scene, layout, self._view, self.x_limits, self.v_limits)
+        view = self._view = View.of(scene, layout, self._view)
         actuators = (scene.force_limit, scene.belt_speed_nominal, scene.belt_speed_limits)
         key = (size, view, scene.title, scene.geometry, scene.alpha, actuators)
         if self._backdrop is None or key != self._backdrop_key:
@@ -193,45 +162,3 @@ def _draw_backdrop(frame: Frame) -> None:
     draw_fixtures(frame)
     draw_axes(frame)
     draw_captions(frame)
-
-
-def _require_pygame() -> None:
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # or pygame greets on standard output
-    with extra("render"):
-        import pygame.font
-    pygame.font.init()  # needs no display; does nothing the second time
-
-
-def checked_size(size: Any) -> tuple[int, int]:
-    """Return the size of a frame (width, height) in pixels.
-
-    Raises:
-        TypeError: if it is no pair. ValueError: if one is not a whole number in ``WIDTHS`` or ``HEIGHTS``.
-    """
-    if not isinstance(size, Sequence) or isinstance(size, str) or len(size) != 2:
-        raise TypeError(f"render_size must be a pair (width, height) of whole numbers, got {size!r}")
-    width, height = size
-    return _checked_whole("render_size width", width, WIDTHS), _checked_whole("render_size height", height, HEIGHTS)
-
-
-def _checked_whole(name: str, value: Any, limits: tuple[int, int]) -> int:
-    low, high = limits
-    try:
-        number = -1 if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        number = -1
-    if not low <= number <= high:
-        raise ValueError(f"{name} must be a whole number in [{low}, {high}], got {brief_repr(value)}")
-    return number
-
-
-def _checked_limits(name: str, value: Any) -> Limits | None:
-    if value is None:
-        return None
-    try:
-        low, high = (float(end) for end in value)
-    except (TypeError, ValueError):
-        low = high = math.nan
-    if not -math.inf < low < high < math.inf:
-        raise ValueError(f"{name} must be None or two finite numbers (low, high) with low < high, got {value!r}")
-    return low, high

@@ -1,10 +1,18 @@
 """What a frame shows, where its parts stand, and which part of the plane they show."""
 
 import math
+import operator
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sd_friction_env.physics.parameters import brief_repr
+
+RENDER_MODES = ("human", "rgb_array")
+WIDTHS, HEIGHTS = (240, 7680), (135, 4320)  # of a frame, in pixels
 
 Point = tuple[float, float]
 Limits = tuple[float, float]
@@ -166,10 +174,8 @@ class View:
         return np.asarray(corner + (points - low) / span * size)
 
     @staticmethod
-    def of(
-        scene: Scene, layout: Layout, before: "View | None", x_limits: Limits | None, v_limits: Limits | None
-    ) -> "View":
-        """Return the view of a scene: the given limits, or those of the frame before, grown as the motion needs."""
+    def of(scene: Scene, layout: Layout, before: "View | None") -> "View":
+        """Return the view of a scene: that of the frame before, grown as the motion needs."""
         speed = max(scene.belt_speed_nominal, scene.belt_speed_limits[1], 0.1)
         if before is not None:
             x_mechanism, x_plot, v_plot = before.x_mechanism, before.x_plot, before.v_plot
@@ -181,9 +187,9 @@ class View:
             else:
                 x_mechanism, x_plot = (-1.5, 0.5), (-1.25, 0.0)
             v_plot = (-2.5 * speed, 1.75 * speed)
-        x_mechanism = x_limits or _grown(x_mechanism, scene.x, 0.25, 0.1)
-        x_plot = x_limits or _grown(x_plot, scene.x, 0.25, 0.05)
-        v_plot = v_limits or _grown(_grown(v_plot, scene.v, 0.5 * speed, 0.1 * speed), scene.v_belt, 0.5 * speed, 0.0)
+        x_mechanism = _grown(x_mechanism, scene.x, 0.25, 0.1)
+        x_plot = _grown(x_plot, scene.x, 0.25, 0.05)
+        v_plot = _grown(_grown(v_plot, scene.v, 0.5 * speed, 0.1 * speed), scene.v_belt, 0.5 * speed, 0.0)
 
         left = layout.belt.left + (96 if scene.level else 34) * layout.unit
         right = layout.belt.right - 34 * layout.unit
@@ -207,3 +213,31 @@ def _grown(limits: Limits, value: float, step: float, margin: float) -> Limits:
     if value > high - margin:
         high = math.ceil((value + margin) / step) * step
     return low, high
+
+
+def checked_size(size: Any) -> tuple[int, int]:
+    """Return the size of a frame (width, height) in pixels.
+
+    Raises:
+        TypeError: if it is no pair. ValueError: if one is not a whole number in ``WIDTHS`` or ``HEIGHTS``.
+    """
+    if not isinstance(size, Sequence) or isinstance(size, str) or len(size) != 2:
+        raise TypeError(f"render_size must be a pair (width, height) of whole numbers, got {size!r}")
+    width, height = size
+    return checked_whole("render_size width", width, WIDTHS), checked_whole("render_size height", height, HEIGHTS)
+
+
+def checked_whole(name: str, value: Any, limits: tuple[int, int]) -> int:
+    """Return a whole number within limits.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    low, high = limits
+    try:
+        number = -1 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = -1
+    if not low <= number <= high:
+        raise ValueError(f"{name} must be a whole number in [{low}, {high}], got {brief_repr(value)}")
+    return number

@@ -76,8 +76,7 @@ def draw_sweeps(rows: Sequence[Row], task: str) -> "Figure":
             axis.plot(
                 [row["value"] for row in mine], [row["amplitude"] for row in mine], label=name, markersize=4, **style
             )
-        axis.set_xlabel(label)
-        axis.set_ylabel("settled amplitude")
+        axis.set(xlabel=label, ylabel="settled amplitude")
         axis.set_ylim(bottom=-0.01)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
     return figure
@@ -139,8 +138,7 @@ def draw_histories(histories: Mapping[str, Table]) -> "Figure":
     time, velocity = r"time $\tau$", r"velocity $\dot x$"
     labels = ((time, r"displacement $x$"), (r"$x$", velocity), (time, f"{velocity}; thin: belt"), (time, "action"))
     for axis, (x_label, y_label) in zip(axes.flat, labels, strict=True):
-        axis.set_xlabel(x_label)
-        axis.set_ylabel(y_label)
+        axis.set(xlabel=x_label, ylabel=y_label)
     axes[0, 0].margins(x=0)
     axes[1, 0].margins(x=0)
     figure.legend(loc="outside upper center", ncols=4, frameon=False)

@@ -79,12 +79,12 @@ def fraction_table(found: Sequence[LimitCycle], counts: Sequence[int]) -> Table:
         name = {LOST_CONTACT: "contact lost", UNDECIDED: "undecided"}.get(label, "")
         if cycle is not None:
             name = f"{cycle.kind} round x = {0.5 * (cycle.x_max + cycle.x_min):.4f}"
-        share = int(counts[label - UNDECIDED]) / total
-        low, high = share_interval(int(counts[label - UNDECIDED]), total)
+        count = int(counts[label - UNDECIDED])
+        share, (low, high) = count / total, share_interval(count, total)
         row = {"label": label, "attractor": name, "amplitude": cycle.amplitude if cycle else math.nan}
         row |= {"fraction": share, "standard_error": math.sqrt(share * (1.0 - share) / total)}
         rows.append(row | {"fraction_low": low, "fraction_high": high})
-    return Table({name: [row[name] for row in rows] for name in rows[0]})
+    return Table.from_rows(rows)
 
 
 def basins(parameters: OscillatorParameters, x: ArrayLike, v: ArrayLike, *, threads: int | None = None) -> Basins:

@@ -43,7 +43,11 @@ _MOST_WORKERS = 10_000
 _CHUNKS_A_WORKER = 2  # in each wave, where results come in waves
 _WATCH = 0.5  # seconds between two looks at whether the parent lives
 _PATIENCE = 3  # times that workers may be lost in a row with no chunk finished between
-_EXTRAS = {"loky": "sweep", "dask": "dask", "ray": "ray"}
+_NEEDED = {  # by backends: the extra that brings them, and the modules
+    "loky": ("sweep", "joblib"),
+    "dask": ("dask", "joblib", "distributed"),
+    "ray": ("ray", "joblib", "ray"),
+}
 _MANIFEST, _LOCK = "sweep.json", ".sweep.lock"
 _LARGEST_MANIFEST = 2**27  # bytes
 _BELONGS = "belongs to"  # name of the text in a chunk's file that says to which sweep, and where in it
@@ -83,12 +87,11 @@ class Engine:
             checked_count("workers", self.workers, 1, _MOST_WORKERS)
         if self.address is not None and self.backend not in ("dask", "ray"):
             raise ValueError(f"address goes with the backends 'dask' and 'ray', got {self.address!r}")
-        needed = {"loky": ("joblib",), "dask": ("joblib", "distributed"), "ray": ("joblib", "ray")}
-        for module in needed.get(self.backend, ()):
+        extra, *modules = _NEEDED.get(self.backend, ("",))
+        for module in modules:
             try:
                 importlib.import_module(module)
             except ImportError:
-                extra = _EXTRAS[self.backend]
                 raise ImportError(
                     f'the backend {self.backend!r} needs {module}: pip install "sd-friction-env[{extra}]"'
                 ) from None
@@ -118,7 +121,7 @@ def stream_chunks(
 ) -> Iterator[Columns]:
     """Yield what :func:`run_chunks` returns: with a folder, or in this process, few results are in memory at a time.
 
-    Arguments and errors are those of :func:`run_chunks`; nothing is checked before the first result is asked for.
+    Nothing is checked before the first result is asked for.
     """
     with _Store(engine.folder, len(chunks), description) as store:
         yield from _stream_chunks(function, chunks, engine, store)
@@ -208,9 +211,7 @@ def _workers(engine: Engine) -> Iterator[Runner]:
 
         def run(function: ChunkFunction, numbered: list[tuple[int, Any]]) -> Iterator[tuple[int, Columns]]:
             with joblib.parallel_config(backend=engine.backend, n_jobs=n_jobs, **threads):
-                if (
-                    engine.backend == "ray"
-                ):  # gives results only when all that was asked for is done: so it is asked often
+                if engine.backend == "ray":  # gives results only when all that was asked for is done: it is asked often
                     parallel = joblib.Parallel(batch_size=1)
                     wave = _CHUNKS_A_WORKER * joblib.effective_n_jobs(n_jobs)
                     waves = [numbered[i : i + wave] for i in range(0, len(numbered), wave)]
@@ -275,16 +276,13 @@ def _causes(error: BaseException) -> str:
 
 def _worker_losses(backend: Backend) -> tuple[type[Exception], ...]:
     """Return the errors that mean that a worker was lost, not that a chunk cannot be computed."""
-    if backend == "loky":
-        module: Any = importlib.import_module("joblib.externals.loky.process_executor")
-        return (module.TerminatedWorkerError,)
-    if backend == "dask":
-        module = importlib.import_module("distributed")
-        return (module.KilledWorker,)
-    if backend == "ray":
-        module = importlib.import_module("ray.exceptions")
-        return (module.RayActorError, module.WorkerCrashedError)
-    return ()
+    module, *names = {
+        "sequential": ("builtins",),
+        "loky": ("joblib.externals.loky.process_executor", "TerminatedWorkerError"),
+        "dask": ("distributed", "KilledWorker"),
+        "ray": ("ray.exceptions", "RayActorError", "WorkerCrashedError"),
+    }[backend]
+    return tuple(getattr(importlib.import_module(module), name) for name in names)
 
 
 class _Store:

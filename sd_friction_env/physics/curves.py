@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,19 +19,8 @@ from sd_friction_env.physics.parameters import RANGES, STATE_LIMIT, OscillatorPa
 from sd_friction_env.physics.tables import Table
 
 _CYCLE_COLUMNS = (
-    "kind",
-    "amplitude",
-    "period",
-    "frequency",
-    "angular_frequency",
-    "stick_fraction",
-    "x_max",
-    "x_min",
-    "x_breakaway",
-    "x_restick",
-    "sticks",
-    "forward_arcs",
-    "floquet_multiplier",
+    *("kind", "amplitude", "period", "frequency", "angular_frequency", "stick_fraction", "x_max", "x_min"),
+    *("x_breakaway", "x_restick", "sticks", "forward_arcs", "floquet_multiplier"),
 )
 
 
@@ -67,7 +55,6 @@ def amplitude_curve(
     *,
     x: float = 0.0,
     v: float | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> Table:
     """Return the attractor at each belt speed: one row each, in the order given.
 
@@ -75,7 +62,6 @@ def amplitude_curve(
         parameters: of the oscillator; their belt speed is not used.
         belt_speeds: of shape (n,), each in [0, 10].
         x, v: the start at every belt speed, in [-10, 10]; by default a mass set down at x = 0 that moves with the belt.
-        progress: called with the number of rows done and their total after each row.
 
     Returns:
         A table with the columns belt_speed, kind ("stick-slip", "pure-slip", "steady-slip", "neutral", "rest" or
@@ -90,13 +76,11 @@ def amplitude_curve(
     if v is not None:
         v = checked_number("v", v, -STATE_LIMIT, STATE_LIMIT)
     rows = []
-    for done, speed in enumerate(speeds.tolist(), start=1):
+    for speed in speeds.tolist():
         try:
             rows.append(_row(limit_cycle(parameters.replace(belt_speed=speed), x, v)))
         except OrbitError as error:
             rows.append(_failed_row(speed, x, speed if v is None else v, str(error)))
-        if progress is not None:
-            progress(done, len(speeds))
     return _table(rows, parameters)
 
 
@@ -120,18 +104,12 @@ def refined_curve(
     return Table(ends | dict(curve), curve.metadata)
 
 
-def attractor_curves(
-    parameters: OscillatorParameters,
-    belt_speeds: ArrayLike,
-    *,
-    progress: Callable[[int, int], None] | None = None,
-) -> Table:
+def attractor_curves(parameters: OscillatorParameters, belt_speeds: ArrayLike) -> Table:
     """Return all attractors at each belt speed, one row each; alpha < 1 has two wells and may have one in each.
 
     Args:
         parameters: of the oscillator; their belt speed is not used.
         belt_speeds: of shape (n,), each in (0, 10].
-        progress: as in :func:`amplitude_curve`.
 
     Returns:
         The columns of :func:`amplitude_curve` and ``well``: "left" or "right" of the middle equilibrium, "only" where
@@ -143,7 +121,7 @@ def attractor_curves(
     """
     speeds = checked_belt_speeds(belt_speeds)
     rows = []
-    for done, speed in enumerate(speeds.tolist(), start=1):
+    for speed in speeds.tolist():
         plant = parameters.replace(belt_speed=speed)
         found = attractors(plant)
         places = [e.x for e in equilibria(plant)]
@@ -151,8 +129,6 @@ def attractor_curves(
         if not found:
             note = "no attractor that keeps contact was found"
             rows.append(_failed_row(speed, math.nan, math.nan, note) | {"well": ""})
-        if progress is not None:
-            progress(done, len(speeds))
     return _table(rows, parameters)
 
 

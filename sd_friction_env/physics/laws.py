@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -143,33 +143,16 @@ def _column(name: str, values: ArrayLike) -> NDArray[np.float64]:
 # Checks ---------------------------------------------------------------------------------------------------------------
 
 
-def checked_friction_law(name: str, value: Any, names: tuple[str, ...]) -> Any:
-    """Return ``value`` if it is one of ``names`` or a friction law whose derivatives are right.
+def checked_law(part: Literal["geometry", "friction"], value: Any, names: tuple[str, ...]) -> Any:
+    """Return ``value`` if it is one of ``names``, or a spring ("geometry") or friction law whose derivatives are right.
 
     Raises:
         ValueError: if it is neither, or a number of the law is not finite.
     """
-    return _checked(name, value, names, FRICTION, _check_stick, check_friction_law, "friction_law")
-
-
-def checked_spring_law(name: str, value: Any, names: tuple[str, ...]) -> Any:
-    """Return ``value`` if it is one of ``names`` or a spring whose derivatives are right.
-
-    Raises:
-        ValueError: if it is neither, or a number of the law is not finite.
-    """
-    return _checked(name, value, names, SPRING, _check_numbers, check_spring_law, "spring_law")
-
-
-def _checked(
-    name: str,
-    value: Any,
-    names: tuple[str, ...],
-    protocol: Any,
-    check_values: Callable[[Any], None],
-    check_all: Callable[[Any], None],
-    decorator: str,
-) -> Any:
+    if part == "geometry":
+        protocol, check_values, check_all, decorator = SPRING, _check_numbers, check_spring_law, "spring_law"
+    else:
+        protocol, check_values, check_all, decorator = FRICTION, _check_stick, check_friction_law, "friction_law"
     if isinstance(value, str) and value in names:
         return value
     law = type(value)
@@ -177,7 +160,7 @@ def _checked(
         text = repr(value)
         text = text if len(text) <= 300 else f"{text[:100]}... ({len(text)} characters)"
         choices = ", ".join(map(repr, names))
-        raise ValueError(f"{name} must be one of {choices}, or a law declared with @{decorator}, got {text}")
+        raise ValueError(f"{part} must be one of {choices}, or a law declared with @{decorator}, got {text}")
     (check_values if _is_built_in(value) else check_all)(value)
     return value
 

@@ -29,7 +29,7 @@ from sd_friction_env.kernel import (
     Stribeck,
     Unexcited,
 )
-from sd_friction_env.physics.laws import checked_friction_law, checked_spring_law, missing_gradient
+from sd_friction_env.physics.laws import checked_law, missing_gradient
 from sd_friction_env.physics.theory import stribeck_coefficients
 
 GEOMETRIES = ("exact", "cubic", "linear", "duffing")
@@ -196,8 +196,8 @@ class OscillatorParameters:
     stiffness_phase: float = _number(0.0, -10.0, 10.0, "phase of the modulation at t = 0", "rad", law="stiffness")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "geometry", _floats(checked_spring_law("geometry", self.geometry, GEOMETRIES)))
-        object.__setattr__(self, "friction", _floats(checked_friction_law("friction", self.friction, FRICTIONS)))
+        object.__setattr__(self, "geometry", _floats(checked_law("geometry", self.geometry, GEOMETRIES)))
+        object.__setattr__(self, "friction", _floats(checked_law("friction", self.friction, FRICTIONS)))
         for name, (low, high) in RANGES.items():
             object.__setattr__(self, name, checked_number(name, getattr(self, name), low, high))
         if self.friction == "stribeck" and self.mu_m > self.mu_s:
@@ -254,8 +254,8 @@ class OscillatorParameters:
         unknown = sorted(set(given) - set(_SI_NUMBERS))
         if unknown:
             raise TypeError(f"a rig has no number {unknown[0]!r}; allowed: {', '.join(_SI_NUMBERS)}")
-        geometry = checked_spring_law("geometry", geometry, GEOMETRIES)
-        friction = checked_friction_law("friction", friction, FRICTIONS)
+        geometry = checked_law("geometry", geometry, GEOMETRIES)
+        friction = checked_law("friction", friction, FRICTIONS)
         rig = {"L": L, "H": H, "V0": V0, "mu_s": mu_s, **given}
         for name in ("V0", *(name for law in (geometry, friction) if isinstance(law, str) for name in _SI_NEEDED[law])):
             if rig.get(name) is None:

@@ -7,6 +7,7 @@ from typing import Any
 from sd_friction_env.extras import extra
 from sd_friction_env.physics.laws import friction_table
 from sd_friction_env.physics.parameters import OscillatorParameters
+from sd_friction_env.storage import parse_yaml
 
 
 def read_rig(path: str | Path) -> OscillatorParameters:
@@ -46,14 +47,10 @@ def _entries(path: Path) -> dict[str, Any]:
             entries: Any = tomllib.loads(content.decode())
         else:
             with extra("train"):
-                import yaml
-            entries = yaml.safe_load(content)
-    except (ValueError, UnicodeDecodeError) as fault:
-        raise ValueError(f"{str(path)!r} is no {ending[1:].upper()} file: {fault}") from None
-    except Exception as fault:  # what PyYAML raises is no ValueError
-        if isinstance(fault, ImportError):
-            raise
-        raise ValueError(f"{str(path)!r} is no YAML file: {' '.join(str(fault).split())}") from None
+                entries = parse_yaml(content.decode())
+    except ValueError as fault:
+        kind = "TOML" if ending == ".toml" else "YAML"
+        raise ValueError(f"{str(path)!r} is no {kind} file: {fault}") from None
     if not isinstance(entries, dict) or not all(isinstance(name, str) for name in entries):
         raise ValueError(f"{str(path)!r} must hold names and values, got {type(entries).__name__}")
     return entries

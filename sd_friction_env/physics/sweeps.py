@@ -4,6 +4,10 @@ All backends run through joblib: only the name ("sequential", "loky", "dask", "r
 divided into chunks by what it computes, never by the number of workers, so any backend gives the same bits. With a
 folder every finished chunk is stored, with its checksum in its name and the sweep that it belongs to inside, and a
 sweep that was killed resumes. One process at a time works in a folder.
+
+In all of them ``plants`` are (n,) oscillators and ``engine`` says where the sweep runs. They raise TypeError or
+ValueError if an argument is not of the type or in the range given, before anything is computed, and SweepError as
+:func:`run_chunks`.
 """
 
 import dataclasses
@@ -67,16 +71,11 @@ def amplitude_sweep(
     """Return the amplitude curve of each plant, as :func:`sd_friction_env.amplitude_curve` does, bit for bit.
 
     Args:
-        plants: (n,) oscillators; their belt speed is not used.
+        plants: their belt speed is not used.
         belt_speeds: (m,), each in [0, 10].
-        engine: where it runs.
         x, v: the start at every belt speed, in [-10, 10].
         all_attractors: whether to list all attractors, as :func:`sd_friction_env.attractor_curves` does.
         chunk: number of belt speeds in a chunk.
-
-    Raises:
-        TypeError, ValueError: if an argument is not of the type or in the range above, before anything is computed.
-        SweepError: see :func:`run_chunks`.
     """
     speeds = checked_belt_speeds(belt_speeds)
     x = checked_number("x", x, -STATE_LIMIT, STATE_LIMIT)
@@ -118,12 +117,7 @@ def basin_sweep(
 
     Args:
         parameters, x_limits, v_limits, shape: as of ``basin_grid``.
-        engine: where it runs.
         chunk: number of starts in a chunk, rounded to whole rows of the grid.
-
-    Raises:
-        TypeError, ValueError: if an argument is not of the type or in the range above, before anything is computed.
-        SweepError: see :func:`run_chunks`.
     """
     grid = _BasinChunks.of(parameters, x_limits, v_limits, shape, chunk)
     results = run_chunks(_basin_chunk, grid.chunks, engine, description=grid.description)
@@ -146,12 +140,10 @@ def basin_file(
     of one v each. Memory holds a few chunks at a time, with loky as with one process, whatever the number of starts.
 
     Args:
-        parameters, x_limits, v_limits, shape, engine, chunk: as of :func:`basin_sweep`.
-        path: of the file.
+        parameters, x_limits, v_limits, shape, chunk: as of :func:`basin_sweep`.
 
     Raises:
-        OSError: if the file cannot be written.
-        TypeError, ValueError, SweepError: as :func:`basin_sweep`, and if the name does not end in .npy.
+        OSError: if the file cannot be written. ValueError: if its name does not end in .npy.
     """
     checked_ending(path, (".npy",))
     grid = _BasinChunks.of(parameters, x_limits, v_limits, shape, chunk)
@@ -217,14 +209,7 @@ def bifurcation_sweep(
 
     A diagram is one chunk, because each of its values starts where the one before ended.
 
-    Args:
-        plants: (n,) oscillators.
-        engine: where it runs.
-        name, values, direction, cycles, transient, lyapunov: as of ``bifurcation_diagram``.
-
-    Raises:
-        TypeError, ValueError: if an argument is not of the type or in the range above, before anything is computed.
-        SweepError: see :func:`run_chunks`.
+    The other arguments are those of ``bifurcation_diagram``.
     """
     checked_count("cycles", cycles, 20 if lyapunov else 1, _MOST)
     arguments = {"direction": direction, "cycles": cycles, "transient": transient, "lyapunov": bool(lyapunov)}
@@ -241,10 +226,7 @@ def response_sweep(
     cycles: int = 32,
     transient: int = 200,
 ) -> list[Table]:
-    """Return the response curve of each plant, as :func:`forced.response_curve` does, bit for bit; one chunk each.
-
-    Arguments and errors are those of :func:`bifurcation_sweep`.
-    """
+    """Return the response curve of each plant, as :func:`forced.response_curve` does, bit for bit; one chunk each."""
     arguments = {"direction": direction, "cycles": cycles, "transient": transient}
     return _diagram_sweep("response", plants, name, values, engine, arguments)
 
@@ -264,28 +246,16 @@ def integrity_sweep(
 
     A plant without basins (excited, or with a belt at rest) has one row of NaN with the reason.
 
-    Args:
-        plants: (n,) oscillators.
-        engine: where it runs.
-        x_limits, v_limits, starts, scales, limit, seed: as of ``basin_integrity``.
-
-    Raises:
-        TypeError, ValueError: if an argument is not of the type or in the range above, before anything is computed.
-        SweepError: see :func:`run_chunks`.
+    The other arguments are those of ``basin_integrity``.
     """
     x, v = checked_grid(x_limits, v_limits, (2, 2))
     check_search(starts, scales, limit, seed)
     arguments = {"starts": starts, "scales": list(scales), "limit": limit, "seed": seed}
     limits = [x.tolist(), v.tolist()]
-    description = {
-        "what": "integrity",
-        "plants": [dataclasses.asdict(p) for p in plants],
-        "limits": limits,
-        **arguments,
-    }
+    described = [dataclasses.asdict(plant) for plant in plants]
+    description = {"what": "integrity", "plants": described, "limits": limits, **arguments}
     chunks = [(plant, limits, arguments) for plant in plants]
-    results = run_chunks(_integrity_chunk, chunks, engine, description=description)
-    return [Table(columns) for columns in results]
+    return [Table(columns) for columns in run_chunks(_integrity_chunk, chunks, engine, description=description)]
 
 
 def _integrity_chunk(chunk: tuple[OscillatorParameters, list[Any], dict[str, Any]]) -> Columns:

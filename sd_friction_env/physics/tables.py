@@ -1,10 +1,12 @@
 """Tidy tables: named columns of equal length, light enough for the base install."""
 
+import csv
 import html
 import itertools
 import json
+import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import IO, Any
 
 import numpy as np
@@ -25,6 +27,12 @@ class Table(dict[str, NDArray[Any]]):
         lengths = {name: len(values) for name, values in self.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"columns must have one length, got {lengths}")
+
+    @classmethod
+    def from_rows(cls, rows: Sequence[Mapping[str, Any]], metadata: Mapping[str, Any] | None = None) -> "Table":
+        """Return rows as a table with the columns of all of them, in that order; NaN where a row has no value."""
+        names = dict.fromkeys(name for row in rows for name in row)
+        return cls({name: [row.get(name, math.nan) for row in rows] for name in names}, metadata)
 
     def __repr__(self) -> str:
         return f"Table of {self.n_rows} rows: {', '.join(self)}"
@@ -86,8 +94,6 @@ class Table(dict[str, NDArray[Any]]):
             OSError: if the file cannot be read.
             ValueError: if it is not such a table.
         """
-        import csv
-
         lines = read_text(path, LARGEST_ARCHIVE).splitlines()
         metadata = {}
         while lines and lines[0].startswith("# "):

@@ -41,12 +41,6 @@ def test_a_point_that_cannot_be_computed_is_a_row_that_says_why():
     assert np.isnan(curve["amplitude"]).all()
 
 
-def test_progress_is_told_row_by_row():
-    calls = []
-    amplitude_curve(CUBIC, [0.1, 0.2, 0.3], progress=lambda done, total: calls.append((done, total)))
-    assert calls == [(1, 3), (2, 3), (3, 3)]
-
-
 @pytest.mark.parametrize("speeds", [[], [[0.1]], [0.1, -0.2], [math.nan], [math.inf]])
 def test_bad_belt_speeds_are_refused(speeds):
     with pytest.raises(ValueError, match="belt_speeds must"):

@@ -301,11 +301,7 @@ def test_the_bent_resonance_jumps_elsewhere_on_the_way_up_than_on_the_way_down()
 
 def test_a_sweep_without_excitation_shows_the_maxima_of_x():
     speeds = [0.1, 0.2, 0.5]
-    seen = []
-    diagram = bifurcation_diagram(
-        OscillatorParameters(), "belt_speed", speeds, cycles=3, transient=600, progress=lambda *done: seen.append(done)
-    )
-    assert seen == [(1, 3), (2, 3), (3, 3)]
+    diagram = bifurcation_diagram(OscillatorParameters(), "belt_speed", speeds, cycles=3, transient=600)
     for speed in speeds:
         x_max = limit_cycle(OscillatorParameters(belt_speed=speed), 1.0, 0.0).x_max
         assert diagram["x"][diagram["value"] == speed] == pytest.approx([x_max] * 3, abs=1e-6)

@@ -42,7 +42,6 @@ def bifurcation_diagram(
     v: float | None = None,
     lyapunov: bool = False,
     period: float | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> Table:
     """Return section points over a parameter, each value starting from the last state of the one before.
 
@@ -59,7 +58,6 @@ def bifurcation_diagram(
         x, v: the start at the first value, and again after a value at which the mass loses contact.
         lyapunov: whether to add the largest exponent of each value.
         period: time between sections; by default that of the excitation at each value.
-        progress: called with the number of values done and their total after each.
 
     Returns:
         A table with the columns value, direction ("up" or "down"), cycle, x, v, stick_fraction (NaN without
@@ -77,7 +75,7 @@ def bifurcation_diagram(
     def measured(strobe: Stroboscope, state: State) -> tuple[dict[str, Any], State | None]:
         return _section_at(strobe, state, transient, cycles, lyapunov)
 
-    columns = _continued(points, direction, measured, (x, v), progress)
+    columns = _continued(points, direction, measured, (x, v))
     section = "stroboscopic" if points[0][1].period > 0.0 else "maxima of x"
     return Table(columns, {"parameters": dataclasses.asdict(parameters), "swept": name, "section": section})
 
@@ -92,7 +90,6 @@ def response_curve(
     transient: int = 200,
     x: float = 0.0,
     v: float | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> Table:
     """Return the response of a forced motion over a parameter, each value starting from the last state of the one
     before: where the ways up and down differ there is hysteresis.
@@ -100,7 +97,7 @@ def response_curve(
     Args:
         parameters: of the oscillator, with one of the excitations acting.
         name: of a number among the parameters, such as "force_frequency".
-        values, direction, transient, x, v, progress: as of :func:`bifurcation_diagram`.
+        values, direction, transient, x, v: as of :func:`bifurcation_diagram`.
         cycles: of the excitation, over which each response is measured, from 1 on.
 
     Returns:
@@ -137,7 +134,7 @@ def response_curve(
         row["stick_fraction"] = recorded.rows[:, kernel.CYCLE_STICK_TIME].mean() / strobe.period
         return {key: [cell] for key, cell in (row | {"note": ""}).items()}, recorded.end
 
-    columns = _continued(_points(parameters, name, values, None), direction, measured, (x, v), progress)
+    columns = _continued(_points(parameters, name, values, None), direction, measured, (x, v))
     return Table(columns, {"parameters": dataclasses.asdict(parameters), "swept": name, "excitation": acting[0]})
 
 
@@ -167,7 +164,6 @@ def _continued(
     direction: Direction,
     measured: Callable[[Stroboscope, State], tuple[dict[str, Any], State | None]],
     start: tuple[float, float | None],
-    progress: Callable[[int, int], None] | None,
 ) -> dict[str, Any]:
     """Return the columns that ``measured`` gives at each value, from the state in which it left the one before."""
     checked_choice("direction", direction, get_args(Direction))
@@ -180,8 +176,6 @@ def _continued(
             part, state = measured(strobe, state or strobe.checked_start(*start))
             rows = len(next(iter(part.values())))
             parts.append({"value": np.full(rows, value), "direction": np.full(rows, way), **part})
-            if progress is not None:
-                progress(len(parts), len(ways) * len(points))
     return {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
 
 

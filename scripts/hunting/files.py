@@ -98,7 +98,7 @@ def _readers(base: Path) -> dict[str, tuple[Path, Reader]]:
         "policy": (base / "policy" / "policy.npz", load_policy),
         "actions": (optimum / "force.npz", lambda path: optimal.optimal_actions(FORCE, path.parent)),
         "value": (optimum / "force-value.npz", lambda path: optimal.OptimalPolicy.load(FORCE, path.parent)),
-        "optimum": (optimum / "force.json", lambda path: optimal.optimal_returns(FORCE, [10**6], path.parent)),
+        "optimum": (optimum / "force.json", lambda path: optimal.stored_returns(FORCE, path.parent)),
         "gains": (base / "classical.json", classical.stored_gains),
         "run": (base / "run" / "config.json", lambda path: runs.load_network(path.parent)),
         "weights": (base / "run" / "policy.pt", lambda path: runs.load_torch_policy(path.parent)),

@@ -45,6 +45,14 @@ from sd_friction_env.pictures import plotting
 from sd_friction_env.storage import save_arrays
 
 
+def _plot(options: argparse.Namespace, width: float, height: float, draw: Callable[..., None], *data: Any) -> None:
+    """Draw data into the file of --plot, if it is given."""
+    if options.plot is not None:
+        figure, axes = plotting.new_figure(width, height, 1, 1)
+        draw(axes[0, 0], *data)
+        plotting.save_figure(figure, options.plot)
+
+
 def _amplitude(options: argparse.Namespace) -> int:
     grid = grid_of(options, belt_speed=False)
     given = options.belt_speed or [numbers("0:0.6:0.005")]
@@ -67,19 +75,30 @@ def _amplitude(options: argparse.Namespace) -> int:
     return 0
 
 
-def _cycle(options: argparse.Namespace) -> int:
-    grid = grid_of(options)
-    x, v = start_of(options)
-    show = progress_bar(len(grid), "cycles")
+def _row_for_each(
+    options: argparse.Namespace, unit: str, row_of: Callable[[OscillatorParameters], dict[str, Any]], **which: bool
+) -> Table:
+    """Return a table with a row for each oscillator of the grid, after the swept parameters."""
+    grid = grid_of(options, **which)
+    show = progress_bar(len(grid), unit)
     rows = []
     for done, (swept, parameters) in enumerate(grid, start=1):
-        cycle = limit_cycle(parameters, x, v)
-        fields = [field.name for field in dataclasses.fields(cycle) if field.name != "parameters"]
-        rows.append(swept | {name: getattr(cycle, name) for name in fields})
+        rows.append(swept | row_of(parameters))
         show(done)
-    table = Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options))
-    if len(rows) == 1 and options.out is None and not options.json:
-        for name, value in rows[0].items():
+    return Table.from_rows(rows, metadata_of(options))
+
+
+def _cycle(options: argparse.Namespace) -> int:
+    start = start_of(options)
+
+    def row_of(parameters: OscillatorParameters) -> dict[str, Any]:
+        cycle = limit_cycle(parameters, *start)
+        names = [field.name for field in dataclasses.fields(cycle) if field.name != "parameters"]
+        return {name: getattr(cycle, name) for name in names}
+
+    table = _row_for_each(options, "cycles", row_of)
+    if table.n_rows == 1 and options.out is None and not options.json:
+        for name, value in next(table.rows()).items():
             print(f"{name:22}{value if isinstance(value, str) else format(value, '.12g')}")
     else:
         emit(options, table)
@@ -89,17 +108,14 @@ def _cycle(options: argparse.Namespace) -> int:
 def _critical(options: argparse.Namespace) -> int:
     if options.belt_speed is not None:
         raise UsageError("--belt-speed is what this command finds: leave it out")
-    grid = grid_of(options, belt_speed=False)
-    show = progress_bar(len(grid), "oscillators")
-    rows: list[dict[str, Any]] = []
-    for done, (swept, parameters) in enumerate(grid, start=1):
-        speeds = critical_belt_speeds(parameters)
-        coefficient = first_lyapunov_coefficient(parameters)
+
+    def row_of(parameters: OscillatorParameters) -> dict[str, Any]:
+        speeds, coefficient = critical_belt_speeds(parameters), first_lyapunov_coefficient(parameters)
         hopf = "" if math.isnan(coefficient) else "supercritical" if coefficient < 0.0 else "subcritical"
-        numbers_ = {"v_b0": speeds.v_b0, "v_b1": speeds.v_b1, "first_lyapunov_coefficient": coefficient}
-        rows.append(swept | numbers_ | {"hopf": hopf, "reason": speeds.reason})
-        show(done)
-    emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options)))
+        found = {"v_b0": speeds.v_b0, "v_b1": speeds.v_b1, "first_lyapunov_coefficient": coefficient}
+        return found | {"hopf": hopf, "reason": speeds.reason}
+
+    emit(options, _row_for_each(options, "oscillators", row_of, belt_speed=False))
     return 0
 
 
@@ -116,10 +132,7 @@ def _chart(options: argparse.Namespace) -> int:
     chart = stability_chart(one_of(options), (name, low, high), against, points=options.points, engine=engine)
     chart.metadata = metadata_of(options) | chart.metadata
     emit(options, chart)
-    if options.plot is not None:
-        figure, axes = plotting.new_figure(6.4, 4.4, 1, 1)
-        plotting.draw_chart(axes[0, 0], chart)
-        plotting.save_figure(figure, options.plot)
+    _plot(options, 6.4, 4.4, plotting.draw_chart, chart)
     return 0
 
 
@@ -160,17 +173,14 @@ def _basins(options: argparse.Namespace) -> int:
         named = zip(shares["label"].tolist(), shares["attractor"].tolist(), strict=True)
         metadata = shares.metadata | {"labels": {str(label): name for label, name in named}}
         if options.out.suffix.lower() == ".npz":
-            save_arrays(
-                options.out, {"x": x, "v": v, "labels": found.labels, "metadata": np.array(json.dumps(metadata))}
-            )
+            about = {"metadata": np.array(json.dumps(metadata))}
+            save_arrays(options.out, {"x": x, "v": v, "labels": found.labels, **about})
         else:
             grid_x, grid_v = np.meshgrid(x, v)
             columns: dict[str, Any] = {"x": grid_x.ravel(), "v": grid_v.ravel(), "label": found.labels.ravel()}
             emit(options, Table(columns, metadata))
-    if options.plot is not None:
-        figure, axes = plotting.new_figure(6.8, 4.8, 1, 1)
-        plotting.draw_basins(axes[0, 0], x, v, found)
-        plotting.save_figure(figure, options.plot)
+    if not on_disk:
+        _plot(options, 6.8, 4.8, plotting.draw_basins, x, v, found)
     return 0
 
 
@@ -196,25 +206,20 @@ def _poincare(options: argparse.Namespace) -> int:
     section = poincare_section(one_of(options), x, v, cycles=options.cycles, transient=options.transient)
     section.metadata = metadata_of(options)
     emit(options, section)
-    if options.plot is not None:
-        figure, axes = plotting.new_figure(5.4, 4.6, 1, 1)
-        plotting.draw_section(axes[0, 0], section)
-        plotting.save_figure(figure, options.plot)
+    _plot(options, 5.4, 4.6, plotting.draw_section, section)
     return 0
 
 
 def _lyapunov(options: argparse.Namespace) -> int:
-    grid = grid_of(options)
-    x, v = start_of(options)
-    show = progress_bar(len(grid), "motions")
-    rows = []
-    for done, (swept, parameters) in enumerate(grid, start=1):
-        found = lyapunov_exponent(parameters, x, v, cycles=options.cycles, transient=options.transient)
-        told = {"largest": found.largest, "standard_error": found.standard_error}
-        exponents = {"first": found.exponents[0], "second": found.exponents[1]}
-        rows.append(swept | told | exponents | {"singular_events": found.singular_events, "cycles": found.cycles})
-        show(done)
-    emit(options, Table({name: [row[name] for row in rows] for name in rows[0]}, metadata_of(options)))
+    start, how = start_of(options), {"cycles": options.cycles, "transient": options.transient}
+
+    def row_of(parameters: OscillatorParameters) -> dict[str, Any]:
+        found = lyapunov_exponent(parameters, *start, **how)
+        first, second = found.exponents
+        row = {"largest": found.largest, "standard_error": found.standard_error, "first": first, "second": second}
+        return row | {"singular_events": found.singular_events, "cycles": found.cycles}
+
+    emit(options, _row_for_each(options, "motions", row_of))
     return 0
 
 
@@ -236,19 +241,8 @@ def _over(
     parts = (with_columns(part, swept) for part, (swept, _) in zip(tables, grid, strict=True))
     named = ({name if column == "value" else column: data for column, data in part.items()} for part in parts)
     emit(options, stacked(named, metadata_of(options)))
-    if options.plot is not None:
-        figure, axes = plotting.new_figure(7.0, 4.4, 1, 1)
-        draw(axes[0, 0], tables[0])
-        plotting.save_figure(figure, options.plot)
+    _plot(options, 7.0, 4.4, draw, tables[0])
     return 0
-
-
-def _bifurcation(options: argparse.Namespace) -> int:
-    return _over(options, sweeps.bifurcation_sweep, plotting.draw_bifurcation, lyapunov=options.exponents)
-
-
-def _response(options: argparse.Namespace) -> int:
-    return _over(options, sweeps.response_sweep, plotting.draw_response)
 
 
 # Options --------------------------------------------------------------------------------------------------------------
@@ -263,10 +257,6 @@ def _add_amplitude(parser: argparse.ArgumentParser) -> None:
 
 def _add_cycle(parser: argparse.ArgumentParser) -> None:
     add_start(parser)
-    add_output(parser, None)
-
-
-def _add_critical(parser: argparse.ArgumentParser) -> None:
     add_output(parser, None)
 
 
@@ -350,10 +340,6 @@ def _add_bifurcation(parser: argparse.ArgumentParser) -> None:
     _add_over(parser, 60, "the diagram")
 
 
-def _add_response(parser: argparse.ArgumentParser) -> None:
-    _add_over(parser, 32, "amplitude and phase")
-
-
 def _command(
     add: Callable[[argparse.ArgumentParser], None], run: Callable[[argparse.Namespace], int], *examples: str
 ) -> Command:
@@ -383,7 +369,11 @@ COMMANDS = {
     ),
     "cycle": _command(_add_cycle, _cycle, "", "--geometry cubic --belt-speed 0.405 --json", "--alpha 0.2 --start -1 0"),
     "critical": _command(
-        _add_critical, _critical, "", "--geometry cubic exact linear --alpha 0.2:0.8:0.1", "--mu-m 0.1575 --json"
+        lambda parser: add_output(parser, None),
+        _critical,
+        "",
+        "--geometry cubic exact linear --alpha 0.2:0.8:0.1",
+        "--mu-m 0.1575 --json",
     ),
     "chart": _command(
         _add_chart,
@@ -421,12 +411,12 @@ COMMANDS = {
     ),
     "bifurcation": _command(
         _add_bifurcation,
-        _bifurcation,
+        lambda given: _over(given, sweeps.bifurcation_sweep, plotting.draw_bifurcation, lyapunov=given.exponents),
         "--force-frequency 1.3 --over force-amplitude 0.01:0.3:0.002 --backend loky --plot diagram.png",
     ),
     "response": _command(
-        _add_response,
-        _response,
+        lambda parser: _add_over(parser, 32, "amplitude and phase"),
+        lambda given: _over(given, sweeps.response_sweep, plotting.draw_response),
         "--force-amplitude 0.1 --over force-frequency 0.5:1.5:0.01 --out response.csv --plot response.png",
         "--geometry duffing --mu-s 0 --mu-m 0 --force-amplitude 0.1 0.2 --over force-frequency 0.8:1.8:0.02",
     ),

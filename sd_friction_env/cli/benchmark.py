@@ -129,7 +129,7 @@ def _table(options: argparse.Namespace) -> int:
     if not rows:
         raise UsageError("no entry has a row for --task and --tier")
     if options.format == "csv":
-        Table({name: [row[name] for row in rows] for name in rows[0]}).write(sys.stdout)
+        Table.from_rows(rows).write(sys.stdout)
     else:
         print(protocol.as_markdown(rows))
     return 0
@@ -153,8 +153,6 @@ def _off_nominal(options: argparse.Namespace) -> int:
 
 
 _ACTIONS = {"run": _run, "verify": _verify, "table": _table, "off-nominal": _off_nominal}
-
-
 COMMANDS = {
     "benchmark": Command(
         _add,

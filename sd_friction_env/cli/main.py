@@ -7,15 +7,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 import sd_friction_env
-from sd_friction_env.cli.options import (
-    BAD_USAGE,
-    FAILURE,
-    INTERRUPTED,
-    Command,
-    FailedError,
-    Parser,
-    UsageError,
-)
+from sd_friction_env.cli.options import BAD_USAGE, FAILURE, INTERRUPTED, Command, FailedError, Parser, UsageError
 
 # By name: the module that holds it, the extra that it needs, and what it gives.
 _COMMANDS = {

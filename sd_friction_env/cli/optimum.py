@@ -164,13 +164,7 @@ def _optimum(options: argparse.Namespace) -> int:
             )
         known = sequences[[stored_seeds.index(seed) for seed in seeds]].astype(np.float64)
     study = optimal.find_optimum(
-        problem,
-        options.grid,
-        beam=options.beam,
-        rounds=options.rounds,
-        known=known,
-        progress=progress,
-        report=report,
+        problem, options.grid, beam=options.beam, rounds=options.rounds, known=known, progress=progress, report=report
     )
     if options.out is None:
         return 0

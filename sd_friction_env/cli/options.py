@@ -31,13 +31,9 @@ FAILURE, BAD_USAGE, INTERRUPTED = 1, 2, 130
 
 _SCALES = ("time_scale", "length_scale", "force_scale")
 _LAWS_OF_THE_PAPER = ("", "exact, cubic", "stribeck")
-_FIELDS = {name: field["meaning"] for name, field in FIELDS.items() if field["law"] in _LAWS_OF_THE_PAPER}
-_FIELDS = {name: meaning for name, meaning in _FIELDS.items() if name not in _SCALES}
-_LAW_FIELDS = {
-    name: f"{field['meaning']} ({field['law']})"
-    for name, field in FIELDS.items()
-    if field["law"] not in _LAWS_OF_THE_PAPER
-}
+_OWN = {name: field for name, field in FIELDS.items() if name not in _SCALES}
+_FIELDS = {name: field["meaning"] for name, field in _OWN.items() if field["law"] in _LAWS_OF_THE_PAPER}
+_LAW_FIELDS = {name: f"{_OWN[name]['meaning']} ({_OWN[name]['law']})" for name in _OWN if name not in _FIELDS}
 _MOST_POINTS = 10_000_000
 
 
@@ -289,13 +285,8 @@ def engine_of(options: argparse.Namespace) -> sweeps.Engine:
             show.append(progress_bar(total, "chunks"))
         show[0](done)
 
-    return sweeps.Engine(
-        backend=options.backend,
-        workers=options.workers,
-        address=options.address,
-        folder=options.folder,
-        progress=progress,
-    )
+    where = {name: getattr(options, name) for name in ("backend", "workers", "address", "folder")}
+    return sweeps.Engine(**where, progress=progress)
 
 
 def add_start(parser: argparse.ArgumentParser) -> None:
@@ -331,13 +322,13 @@ def check_output(options: argparse.Namespace) -> None:
         plotting.new_figure(1.0, 1.0, 1, 1)  # says what to install if matplotlib is missing
 
 
-def _plain(value: Any) -> Any:
-    """Return a value as JSON can say it: NaN and infinity become null."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _as_json(table: Table) -> str:
-    rows = [{name: _plain(value) for name, value in row.items()} for row in table.rows()]
+    """Return a table as JSON; NaN and infinity become null."""
+
+    def plain(value: Any) -> Any:
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    rows = [{name: plain(value) for name, value in row.items()} for row in table.rows()]
     return json.dumps({"metadata": table.metadata, "rows": rows}, indent=1, allow_nan=False)
 
 
@@ -361,11 +352,7 @@ def emit(options: argparse.Namespace, table: Table) -> None:
 
 
 def metadata_of(options: argparse.Namespace) -> dict[str, Any]:
-    return {
-        "sd_friction_env": sd_friction_env.__version__,
-        "numpy": np.__version__,
-        "command": command_line(options),
-    }
+    return {"sd_friction_env": sd_friction_env.__version__, "numpy": np.__version__, "command": command_line(options)}
 
 
 def progress_bar(total: int, unit: str) -> Callable[[int], None]:

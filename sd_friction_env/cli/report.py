@@ -9,13 +9,7 @@ import numpy as np
 import scipy
 
 import sd_friction_env
-from sd_friction_env.cli.options import (
-    Command,
-    FailedError,
-    UsageError,
-    check_at_least,
-    command_line,
-)
+from sd_friction_env.cli.options import Command, FailedError, UsageError, check_at_least, command_line
 from sd_friction_env.environments.ids import TASKS, TIERS
 from sd_friction_env.extras import extra
 from sd_friction_env.storage import AGENTS
@@ -90,13 +84,7 @@ COMMANDS = {
     "report": Command(
         _add,
         _report,
-        [
-            "",
-            "--task belt --tier nominal --out elsewhere",
-            "--agents runs",
-            "--publish figures",
-            "--quick",
-        ],
+        ["", "--task belt --tier nominal --out elsewhere", "--agents runs", "--publish figures", "--quick"],
         TEXT,
     )
 }

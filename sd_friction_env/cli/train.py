@@ -29,35 +29,10 @@ the same command or the run folder alone, and reaches the same weights as an uni
 Watch a run: tensorboard --logdir runs"""
 
 # What determines a run's result; a run folder knows it, so --resume can do without.
-_SETTINGS = (
-    "task",
-    "tier",
-    "env_id",
-    "env_arg",
-    "algo",
-    "start_from",
-    "implementation",
-    "seed",
-    "timesteps",
-    "envs",
-    "hyperparameters",
-    "overrides",
-    "device",
-    "threads",
-    "eval_freq",
-    "eval_episodes",
-)
 _PLANNED = (
-    "start_from",
-    "implementation",
-    "timesteps",
-    "envs",
-    "seed",
-    "eval_freq",
-    "eval_episodes",
-    "device",
-    "threads",
+    *("start_from", "implementation", "timesteps", "envs", "seed", "eval_freq", "eval_episodes", "device", "threads"),
 )
+_SETTINGS = ("task", "tier", "env_id", "env_arg", "algo", "hyperparameters", "overrides", *_PLANNED)
 
 
 def _add(parser: argparse.ArgumentParser) -> None:

@@ -114,14 +114,6 @@ class Kind:
         return sensor_fits and self.actuator in (None, env.task.actuator)
 
 
-def _linear(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
-    return LinearFeedback.from_env(env, values[:-1], values[-1])
-
-
-def _velocity(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
-    return VelocityFeedback.from_env(env, values[0])
-
-
 def _lqr(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
     return LinearFeedback.from_env(env, lqr_gains(env, *(10.0**value for value in values)))
 
@@ -134,14 +126,6 @@ def _scheduled_lqr(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
     gains = [lqr_gains(env, *weights, plant) for plant in plants]
     places = [nearest_equilibrium(plant, Readings.from_env(env).x_offset) for plant in plants]
     return ScheduledFeedback.from_env(env, tuple(speeds), tuple(gains), tuple(places))
-
-
-def _super_twisting(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
-    return SuperTwisting.from_env(env, *values)
-
-
-def _soft(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
-    return SoftBelt.from_env(env, *(10.0**value for value in values))
 
 
 def _dither(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
@@ -157,10 +141,6 @@ def _filtered_sliding(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
     slope, layer, pole, amplitude = values
     steep = -np.sign(amplitude) / 10.0**layer
     return FilteredFeedback.from_env(env, x_gain=steep * slope, v_gain=steep, pole=pole, amplitude=abs(amplitude))
-
-
-def _delayed(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
-    return DelayedFeedback.from_env(env, gain=values[0], delay=max(1, round(values[1])))
 
 
 def _sliding(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
@@ -186,10 +166,6 @@ def _x_gain(env: SDFrictionEnv) -> Range:
 
 def _v_gain(env: SDFrictionEnv) -> Range:
     return _gain(1.0 / Readings.from_env(env).v_scale)
-
-
-def _velocity_gain(env: SDFrictionEnv) -> Range:
-    return _gain(Readings.from_env(env).authority / Readings.from_env(env).v_scale)
 
 
 def _linear_ranges(env: SDFrictionEnv) -> dict[str, Range]:
@@ -226,12 +202,17 @@ _CORRECTIONS = {
     "v correction": Range(0.0, 10.0, low_is="the model finds the velocity by itself"),
 }
 KINDS: dict[str, Kind] = {
-    "velocity feedback": Kind(_velocity, lambda env: {"gain": _velocity_gain(env)}),
-    "linear state feedback": Kind(_linear, _linear_ranges),
+    "velocity feedback": Kind(
+        lambda env, values: VelocityFeedback.from_env(env, *values),
+        lambda env: {"gain": _gain(Readings.from_env(env).authority / Readings.from_env(env).v_scale)},
+    ),
+    "linear state feedback": Kind(
+        lambda env, values: LinearFeedback.from_env(env, values[:-1], values[-1]), _linear_ranges
+    ),
     "LQR": Kind(_lqr, lambda env: {"log10 weight of x": _WEIGHT, "log10 weight of the action": _WEIGHT}),
     "sliding mode": Kind(_sliding, lambda env: {"slope": _slope(env), "log10 layer": _LAYER, "amplitude": _AMPLITUDE}),
     "super-twisting": Kind(
-        _super_twisting,
+        lambda env, values: SuperTwisting.from_env(env, *values),
         lambda env: {
             "slope": _slope(env),
             "proportional": _gain(Readings.from_env(env).v_scale ** -0.5),
@@ -241,7 +222,11 @@ KINDS: dict[str, Kind] = {
     "LQR, gains scheduled by belt speed": Kind(
         _scheduled_lqr, lambda env: {"log10 weight of x": _WEIGHT, "log10 weight of the action": _WEIGHT}
     ),
-    "soft belt": Kind(_soft, lambda env: _SOFT, actuator="belt_speed"),
+    "soft belt": Kind(
+        lambda env, values: SoftBelt.from_env(env, *(10.0**value for value in values)),
+        lambda env: _SOFT,
+        actuator="belt_speed",
+    ),
     "dither": Kind(
         _dither,
         lambda env: {"amplitude": _SHARE, "period in control intervals": _PERIOD},
@@ -249,7 +234,10 @@ KINDS: dict[str, Kind] = {
         everywhere=True,
     ),
     "delayed displacement feedback": Kind(
-        _delayed, lambda env: {"gain": _x_gain(env), "delay": _DELAY}, needs_velocity=False, everywhere=True
+        lambda env, values: DelayedFeedback.from_env(env, gain=values[0], delay=max(1, round(values[1]))),
+        lambda env: {"gain": _x_gain(env), "delay": _DELAY},
+        needs_velocity=False,
+        everywhere=True,
     ),
     "linear feedback, velocity estimated": Kind(
         _filtered,

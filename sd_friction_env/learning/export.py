@@ -66,14 +66,12 @@ class Interface:
         task, speed = env.task, env.nominal.belt_speed
         if task.show_parameters:
             raise ValueError("an agent that is shown parameters cannot be exported: they cannot be measured")
-        assert task.x_offset is not None  # set by the environment, like the other scales
-        assert task.x_scale is not None
-        assert task.v_scale is not None
-        names, offsets, scales = ["x"], [task.x_offset], [task.x_scale]
+        x_offset, x_scale, v_scale = task.scales
+        names, offsets, scales = ["x"], [x_offset], [x_scale]
         by_force, relative = task.actuator == "force", "belt_speed" in task.randomise
         unit = 1.0 if relative else speed
         if task.sensor == "state":
-            names, offsets, scales = [*names, "v"], [*offsets, 0.0], [*scales, task.v_scale]
+            names, offsets, scales = [*names, "v"], [*offsets, 0.0], [*scales, v_scale]
             if not by_force:
                 names = [*names, "v_belt/belt_speed" if relative else "v_belt"]
                 offsets, scales = [*offsets, unit], [*scales, task.belt_authority * unit]

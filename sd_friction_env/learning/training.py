@@ -268,7 +268,7 @@ class _Supervisor(BaseCallback):
 
     def table(self) -> Table:
         """Return all evaluations so far."""
-        return Table({name: [row[name] for row in self.rows] for name in self.rows[0]})
+        return Table.from_rows(self.rows)
 
 
 # Training -------------------------------------------------------------------------------------------------------------

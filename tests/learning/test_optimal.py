@@ -21,6 +21,11 @@ OWN = [OPEN[tier]["belt"] for tier in ("blind-hard", "drifting", "excited")]  # 
 STORED = [*TASKS.values(), *RANDOMISED.values(), *OWN]
 
 
+def stored_returns(env_id, seeds, directory=optimal.OPTIMUM_DIRECTORY):
+    table = optimal.stored_returns(env_id, directory)
+    return None if table is None else np.array([table[seed] for seed in seeds])
+
+
 def write_unsealed(path, content):
     """Write a JSON file as an earlier version did, without a digest: only what is in it can then be refused."""
     path.write_text(json.dumps({name: value for name, value in content.items() if name != "sha256"}), encoding="utf-8")
@@ -49,13 +54,13 @@ def test_stored_sequences_replayed_in_the_environment_return_what_is_stored(env_
     assert actions.dtype == np.float32
     assert np.abs(actions).max() <= 1.0
     replayed = returns_of(env_id, seeds, lambda i, step, info: actions[i, step])
-    np.testing.assert_allclose(replayed, optimal.optimal_returns(env_id, seeds), rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(replayed, stored_returns(env_id, seeds), rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("env_id", STORED)
 def test_optimum_beats_simple_controllers_from_every_start(env_id):
     seeds, _ = optimal.optimal_actions(env_id)
-    optimum = optimal.optimal_returns(env_id, seeds)
+    optimum = stored_returns(env_id, seeds)
     problem = optimal.make_problem(env_id, seeds)
     shape = (len(seeds), problem.steps)
     for action in (0.0, -1.0, -0.5, 0.5, 1.0):
@@ -103,8 +108,8 @@ def test_seeds_stored_are_the_first_of_the_protocol():
 @pytest.mark.parametrize("task", sorted(TASKS))
 def test_sensed_tier_has_the_nominal_optimum_for_a_replay_there_returns_the_same(task):
     seeds, actions = optimal.optimal_actions(SENSED[task])
-    reference = optimal.optimal_returns(SENSED[task], seeds)
-    assert reference.tolist() == optimal.optimal_returns(TASKS[task], seeds).tolist()
+    reference = stored_returns(SENSED[task], seeds)
+    assert reference.tolist() == stored_returns(TASKS[task], seeds).tolist()
     replayed = returns_of(SENSED[task], seeds[:5], lambda i, step, info: actions[i, step])
     np.testing.assert_allclose(replayed, reference[:5], rtol=0.0, atol=1e-9)
 
@@ -210,16 +215,12 @@ def count(taken, steps, label):
         yield step
 
 
-def test_unknown_ids_have_no_reference_and_unknown_seeds_are_refused(tmp_path):
-    assert optimal.optimal_returns("SDFriction/Elsewhere-v0", [1_000_000]) is None
-    assert optimal.optimal_returns(TASKS["belt"], [1_000_000], directory=tmp_path) is None
-    assert optimal.optimal_returns("sd_friction_env:SDFriction/Force-v0", [1_000_000]) is not None
-    with pytest.raises(ValueError, match="seed 3 "):
-        optimal.optimal_returns(TASKS["force"], [1_000_000, 3])
+def test_unknown_ids_have_no_reference(tmp_path):
+    assert stored_returns("SDFriction/Elsewhere-v0", [1_000_000]) is None
+    assert stored_returns(TASKS["belt"], [1_000_000], directory=tmp_path) is None
+    assert stored_returns("sd_friction_env:SDFriction/Force-v0", [1_000_000]) is not None
     with pytest.raises(FileNotFoundError, match="no optimum"):
         optimal.optimal_actions("SDFriction/Elsewhere-v0")
-    with pytest.raises(ValueError, match="seed 1000032 "):
-        optimal.optimal_returns(RANDOMISED["force"], [1_000_031, 1_000_032])
 
 
 @pytest.mark.parametrize(
@@ -237,7 +238,7 @@ def test_randomised_reference_of_another_environment_is_refused(tmp_path, change
     change(content["fingerprint"])
     write_unsealed(path, content)
     with pytest.raises(RuntimeError, match=message):
-        optimal.optimal_returns(RANDOMISED["belt"], [1_000_000], directory=tmp_path)
+        stored_returns(RANDOMISED["belt"], [1_000_000], directory=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -256,7 +257,7 @@ def test_reference_of_another_environment_is_refused(tmp_path, change, message):
     change(content["fingerprint"])
     write_unsealed(path, content)
     with pytest.raises(RuntimeError, match=message):
-        optimal.optimal_returns(TASKS["force"], [1_000_000], directory=tmp_path)
+        stored_returns(TASKS["force"], [1_000_000], directory=tmp_path)
 
 
 def test_saving_and_reading_keeps_returns_and_sequences(tmp_path):
@@ -264,7 +265,7 @@ def test_saving_and_reading_keeps_returns_and_sequences(tmp_path):
     problem = optimal.make_problem(TASKS["belt"], seeds)
     actions = np.random.default_rng(4).uniform(-1.0, 1.0, (2, problem.steps))
     saved = optimal.save_optimum(problem, seeds, actions, {"command": "test"}, tmp_path)
-    assert optimal.optimal_returns(problem.env_id, [4, 3], directory=tmp_path).tolist() == saved[::-1].tolist()
+    assert stored_returns(problem.env_id, [4, 3], directory=tmp_path).tolist() == saved[::-1].tolist()
     stored_seeds, stored = optimal.optimal_actions(problem.env_id, directory=tmp_path)
     assert stored_seeds == seeds
     np.testing.assert_allclose(stored, actions, atol=1.0 / optimal.ACTION_LEVELS)
@@ -359,7 +360,7 @@ def test_a_table_of_optima_that_cannot_be_is_refused_by_name(tmp_path, change):
     change(content)
     write_unsealed(tmp_path / "force.json", content)
     with pytest.raises(optimal.DamagedStudyError, match=r"force\.json.* or is damaged .*--task force`"):
-        optimal.optimal_returns(TASKS["force"], [1_000_000], directory=tmp_path)
+        stored_returns(TASKS["force"], [1_000_000], directory=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -379,7 +380,7 @@ def test_a_fingerprint_that_lacks_something_is_that_of_another_environment(tmp_p
     change(content)
     write_unsealed(tmp_path / "force.json", content)
     with pytest.raises(RuntimeError, match="was computed for another environment"):
-        optimal.optimal_returns(TASKS["force"], [1_000_000], directory=tmp_path)
+        stored_returns(TASKS["force"], [1_000_000], directory=tmp_path)
 
 
 # The policy that acts on a value function -----------------------------------------------------------------------------
@@ -391,7 +392,7 @@ def test_policy_suppresses_and_comes_close_to_the_optimum(env_id, least):
     table = evaluation.evaluate(OptimalPolicy.load(env_id), env_id, seeds)
     assert table["suppressed"].all()
     passive = np.nansum(evaluation.passive_episodes(env_id, seeds).reward, axis=1)
-    assert least < scores.score(table["return"], passive, optimal.optimal_returns(env_id, seeds)) < 1.0
+    assert least < scores.score(table["return"], passive, stored_returns(env_id, seeds)) < 1.0
 
 
 @pytest.mark.parametrize(("env_id", "sizes"), [(TASKS["force"], (31, 31)), (TASKS["belt"], (21, 31, 5))])
@@ -517,8 +518,8 @@ def test_randomised_run_stores_what_can_be_read_again(tmp_path, capsys):
     assert main(["optimum", *small, "--out", str(tmp_path)]) == 0
     seeds, actions = optimal.optimal_actions(RANDOMISED["force"], tmp_path)
     assert seeds == [1_000_000, 1_000_001]
-    returns = optimal.optimal_returns(RANDOMISED["force"], seeds, tmp_path)
-    best = optimal.optimal_returns(RANDOMISED["force"], seeds)
+    returns = stored_returns(RANDOMISED["force"], seeds, tmp_path)
+    best = stored_returns(RANDOMISED["force"], seeds)
     np.testing.assert_allclose(returns, best, rtol=0.02)  # even so small a grid
     problem = optimal.make_problem(RANDOMISED["force"], seeds)
     assert problem.returns(actions.astype(np.float64)).tolist() == returns.tolist()

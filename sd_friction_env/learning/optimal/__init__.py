@@ -32,7 +32,6 @@ from sd_friction_env.learning.optimal.stored import (
     DamagedStudyError,
     fingerprint,
     optimal_actions,
-    optimal_returns,
     save_optimum,
     stored_returns,
     stored_study,

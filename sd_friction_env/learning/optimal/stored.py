@@ -203,9 +203,11 @@ def _checked_table(env_id: str, directory: Path) -> dict[int, float]:
 
 
 def stored_returns(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[int, float] | None:
-    """Return the best known returns that are stored for an id, by seed; None if none are stored.
+    """Return the best known undiscounted returns from the starts of ``reset(seed=...)``, by seed; None: there are none.
 
-    See :func:`optimal_returns`.
+    Where parameters are hidden they are those of a controller that knows each episode's parameters and their changes to
+    come; where the sensor sees x only, of one that sees the state (tiers that differ in the sensor share plants, starts
+    and optimum). Both are upper bounds for controllers that do not.
 
     Raises:
         RuntimeError: if the environment has changed since they were computed, or (DamagedStudyError) the file cannot be
@@ -220,33 +222,6 @@ def stored_returns(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[int
 def bare_id(env_id: str) -> str:
     """Return an environment's id without the module before it."""
     return env_id.rpartition(":")[2]
-
-
-def optimal_returns(
-    env_id: str, seeds: Sequence[int], directory: Path = OPTIMUM_DIRECTORY
-) -> NDArray[np.float64] | None:
-    """Return the best known undiscounted return from the starts of ``reset(seed=...)``, shape (n,).
-
-    Where parameters are hidden it is that of a controller that knows each episode's parameters and their changes to
-    come; where the sensor sees x only, of one that sees the state (tiers that differ in the sensor share plants, starts
-    and optimum). Both are upper bounds for controllers that do not. None if the id has no reference.
-
-    Raises:
-        ValueError: if a seed is not among those stored.
-        RuntimeError: if the environment has changed since the reference was computed, or (DamagedStudyError) its file
-            cannot be read.
-    """
-    env_id = bare_id(env_id)
-    table = stored_returns(env_id, directory)
-    if table is None:
-        return None
-    missing = [int(seed) for seed in seeds if int(seed) not in table]
-    if missing:
-        raise ValueError(
-            f"no optimum is stored for seed {missing[0]} of {env_id}; stored: {min(table)} to {max(table)} "
-            f"({len(table)} seeds)"
-        )
-    return np.array([table[int(seed)] for seed in seeds])
 
 
 def optimal_actions(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> tuple[list[int], NDArray[np.float32]]:

@@ -173,7 +173,7 @@ class Report:
             "training": self.training,
             "histories": histories,
         }
-        return {name: _table(rows) for name, rows in made.items() if rows}
+        return {name: Table.from_rows(rows) for name, rows in made.items() if rows}
 
     def overall(self) -> list[Row]:
         """Return the rows of :func:`over_tasks`."""
@@ -258,12 +258,6 @@ class Report:
             for name in names:
                 os.replace(Path(place) / name, folder / name)
         return [folder / name for name in names]
-
-
-def _table(rows: Sequence[Row]) -> Table:
-    """Return rows as a table with the columns of all of them, NaN where a row has none."""
-    names = dict.fromkeys(name for row in rows for name in row)
-    return Table({name: [row.get(name, float("nan")) for row in rows] for name in names})
 
 
 def _best(rows: Sequence[Row], kind: str) -> str:

@@ -96,7 +96,7 @@ def draw_learning(rows: Sequence[Row], references: Mapping[str, float]) -> "Figu
     for column, over in enumerate(("steps", "seconds")):
         for style, algorithm in zip(_LINES, algorithms, strict=False):
             mine = [row for row in rows if (row["algorithm"], row["over"]) == (algorithm, over)]
-            table = Table({name: [row[name] for row in mine] for name in rows[0]})
+            table = Table.from_rows(mine)
             if not table.n_rows:
                 continue
             label = f"{algorithm}, {mine[0]['runs']} run{'s' if mine[0]['runs'] > 1 else ''}"

@@ -11,9 +11,9 @@ it is switched on.
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,9 +26,41 @@ from sd_friction_env.learning.plan import make_plan
 from sd_friction_env.physics.simulation import Trajectory, amplitude
 from sd_friction_env.pictures import plotting
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 TASKS = {task: environment_id(task) for task in ("force", "belt")}
 SWEPT_BELT_SPEEDS = np.arange(0.05, 0.451, 0.025)
 SWITCH_ON = 300  # control intervals of passive motion in the histories
+
+
+@plotting.house_style()
+def draw_before_and_after(histories: Mapping[str, Trajectory], switched_on: float, title: str) -> "Figure":
+    """Draw displacement, velocity and phase portrait of controlled histories, control starting at ``switched_on``.
+
+    Args:
+        histories: one row of panels each, by name. switched_on: time at which control begins. title: of the figure.
+    """
+    figure, axes = plotting.new_figure(11.0, 2.9 * len(histories), len(histories), 3, width_ratios=(2.2, 2.2, 1.6))
+    figure.suptitle(title)
+    for row, (name, history) in zip(axes, histories.items(), strict=True):
+        t, x, v, belt = history.t, history.x, history.v, history.v_belt
+        before = t <= switched_on
+        for axis, values, label in ((row[0], x, r"displacement $x$"), (row[1], v, r"velocity $\dot x$")):
+            axis.axvspan(switched_on, t[-1], color="0.95", zorder=0)
+            axis.plot(t[before], values[before], color=plotting.GREY, linewidth=1.4)
+            axis.plot(t[~before], values[~before], color=plotting.GREEN, linewidth=1.4)
+            axis.set(xlabel=r"time $\tau$", ylabel=label)
+            axis.margins(x=0)
+        row[0].set_title(name, loc="left", fontsize=10)
+        row[1].plot(t, belt, color=plotting.BLACK, linewidth=1.0, linestyle=(0, (4, 2)), label=r"belt $v_b$")
+        row[1].legend(loc="lower right", fontsize=8, frameon=False)
+        row[2].plot(x[before], v[before], color=plotting.GREY, linewidth=1.2, label="passive")
+        row[2].plot(x[~before], v[~before], color=plotting.GREEN, linewidth=1.2, label="controlled")
+        row[2].plot(x[-1:], v[-1:], marker="o", color=plotting.BLACK, markersize=5, linestyle="none", label="end")
+        row[2].set(xlabel=r"$x$", ylabel=r"$\dot x$")
+        row[2].legend(loc="lower left", fontsize=8, frameon=False)
+    return figure
 
 
 def heading(text: str) -> None:
@@ -145,8 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows += compare(task, policies)
         print(evaluation.format_summary(rows))
         print("\nscore: 0 passive, 1 optimal; suppressed: share of episodes that end still, slipping, at nominal speed")
-        columns = {name: [row[name] for row in rows] for name in rows[0]}
-        Table(columns, {"command": " ".join(sys.argv)}).to_csv(out / "comparison.csv")
+        Table.from_rows(rows, {"command": " ".join(sys.argv)}).to_csv(out / "comparison.csv")
 
         points = {}
         for task, env_id in TASKS.items():
@@ -155,7 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         paper.draw_3(table, out / "figure_3_controlled.png", {"exact": points}, OscillatorParameters().belt_speed)
         histories = {f"control by {task}": switched_on(learned[task], env_id) for task, env_id in TASKS.items()}
         when = SWITCH_ON * evaluation.make_env(TASKS["force"]).task.control_interval
-        figure = plotting.draw_before_and_after(histories, when, "Before and after control is switched on")
+        figure = draw_before_and_after(histories, when, "Before and after control is switched on")
         plotting.save_figure(figure, out / "before_and_after.png")
     except OSError as error:
         print(f"demo: cannot write into --out {str(out)!r}: {error}", file=sys.stderr)

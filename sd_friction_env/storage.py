@@ -92,9 +92,6 @@ def atomic_file(path: PathLike, mode: str = "w", *, keep: bool = False) -> Itera
 
     Args:
         keep: whether the old file is kept as its predecessor, "NAME.previous".
-
-    Raises:
-        OSError: if the file cannot be written.
     """
     target = Path(path)
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
@@ -142,11 +139,7 @@ def open_regular(path: PathLike, most: int = LARGEST_ARCHIVE) -> io.BufferedRead
 
 
 def read_bytes(path: PathLike, most: int = LARGEST_ARCHIVE) -> bytes:
-    """Return the content of a file.
-
-    Raises:
-        OSError, StoredFileError: as :func:`open_regular`.
-    """
+    """Return the content of a file."""
     with open_regular(path, most) as file:
         size = os.fstat(file.fileno()).st_size
         data = file.read(size + 1)
@@ -166,11 +159,7 @@ def read_text(path: PathLike, most: int = LARGEST_JSON) -> str:
 
 
 def file_digest(path: PathLike) -> str:
-    """Return the SHA-256 digest of a file, in hexadecimal.
-
-    Raises:
-        OSError, StoredFileError: as :func:`open_regular`.
-    """
+    """Return the SHA-256 digest of a file, in hexadecimal."""
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -192,11 +181,7 @@ def naming(path: PathLike) -> Iterator[None]:
 
 
 def is_sealed(path: PathLike) -> bool:
-    """Return whether a JSON file or an archive has a seal, right or wrong.
-
-    Raises:
-        OSError, StoredFileError: as :func:`open_regular`.
-    """
+    """Return whether a JSON file or an archive has a seal, right or wrong."""
     end = read_bytes(path)[-200:]
     return end[-_COMMENT_LENGTH:].startswith(_COMMENT) or bool(_SEALED_TEXT.search(end.decode("utf-8", "replace")))
 
@@ -223,9 +208,6 @@ def write_json(path: PathLike, content: Mapping[str, Any], *, indent: int | None
 
     Args:
         indent: see :func:`json_text`. keep: see :func:`atomic_file`.
-
-    Raises:
-        OSError: if it cannot be written.
         ValueError: if a number is not finite, or it would be too large to be read again.
     """
     unsealed = {name: value for name, value in content.items() if name != _SEAL_KEY}
@@ -361,11 +343,7 @@ def read_yaml(path: PathLike) -> Any:
 
 @contextlib.contextmanager
 def sealed_archive(path: PathLike, *, keep: bool = False) -> Iterator[BinaryIO]:
-    """Open a file to write a zip archive to; sealed, it takes its place when complete (see :func:`atomic_file`).
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+    """Open a file to write a zip archive to; sealed, it takes its place when complete (see :func:`atomic_file`)."""
     with atomic_file(path, "w+b", keep=keep) as file:
         yield file
         file.seek(-2, os.SEEK_END)

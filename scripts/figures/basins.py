@@ -21,7 +21,7 @@ def compute() -> Table:
             where = {"alpha": plant.alpha, "belt_speed": plant.belt_speed, "kind": cycle.kind}
             size = {"x_min": cycle.x_min, "x_max": cycle.x_max, "amplitude": cycle.amplitude}
             rows.append(where | size | {"fraction": share, "standard_error": error})
-    return Table({name: [row[name] for row in rows] for name in rows[0]}, metadata(PLANTS))
+    return Table.from_rows(rows, metadata(PLANTS))
 
 
 @plotting.house_style()

@@ -35,7 +35,7 @@ def compute() -> Table:
             rows.append(row | {"least_x": diagram["x"][part].min(), "greatest_x": diagram["x"][part].max()})
     chaos = lyapunov_exponent(PLANT, *ON_THE_CHAOS, cycles=20_000)
     exponent = {"exponent at parameters 1": f"{chaos.largest:.5f}, standard error {chaos.standard_error:.5f}"}
-    return Table({name: [row[name] for row in rows] for name in rows[0]}, metadata([PLANT]) | exponent)
+    return Table.from_rows(rows, metadata([PLANT]) | exponent)
 
 
 @plotting.house_style()

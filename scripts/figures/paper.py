@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from sd_friction_env.physics import theory
 from sd_friction_env.physics.curves import refined_curve
 from sd_friction_env.physics.orbits import rest_place
 from sd_friction_env.pictures import plotting
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SAMPLES = 400
 CYCLE_SPEEDS = (0.05, 0.20, 0.405)
@@ -25,6 +28,26 @@ QUANTITIES = {
     "angular_frequency": r"frequency, radians per unit of time",
 }
 LINEAR = OscillatorParameters(geometry="linear")
+# Small and solid over large and hollow, so that neither hides the other.
+_CONTROLLED = (
+    {"marker": "o", "markersize": 4.0, "color": plotting.GREEN, "zorder": 4},
+    {
+        "marker": "s",
+        "markersize": 8.5,
+        "color": plotting.GREEN,
+        "markerfacecolor": "none",
+        "markeredgewidth": 1.5,
+        "zorder": 3,
+    },
+    {"marker": "^", "markersize": 11.0, "color": plotting.GREEN, "markerfacecolor": "none", "zorder": 3},
+)
+
+
+@plotting.house_style()
+def _draw_controlled_points(axis: "Axes", series: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> None:
+    """Lay closed-loop amplitudes over a passive curve: (belt speeds, amplitudes) by name."""
+    for style, (name, (speeds, amplitudes)) in zip(_CONTROLLED, series.items(), strict=False):
+        axis.plot(speeds, amplitudes, linestyle="none", label=name, **style)  # type: ignore[arg-type]
 
 
 def plant(geometry: str, ratio: float) -> OscillatorParameters:
@@ -123,7 +146,7 @@ def draw_3(
         plotting.draw_amplitude_curve(axis, found)
         plotting.mark_critical_speeds(axis, found["v_b0"][0], found["v_b1"][0])
         points = (controlled or {}).get(geometry, {})
-        plotting.draw_controlled_points(axis, points)
+        _draw_controlled_points(axis, points)
         if points and trained is not None:
             label = f"trained at $v_b = {trained:g}$"
             axis.axvline(trained, color=plotting.GREEN, linewidth=1.2, linestyle=":", label=label)

@@ -25,11 +25,7 @@ AGENTS_TEXT = f"{', '.join(NAMED)}, a run folder, a policy's .npz, an .onnx, or 
 
 
 def stored_agent(path: Path) -> tuple[NetworkPolicy, dict[str, Any] | None]:
-    """Return the agent at a path and, from a run folder, the environment that it was trained for: id and kwargs.
-
-    Raises:
-        ValueError: if it is neither a finished run folder nor a policy file.
-    """
+    """Return the agent at a path and, from a run folder, the environment that it was trained for: id and kwargs."""
     if path.suffix.lower() == ".npz":
         try:
             return load_policy(path), None
@@ -40,11 +36,7 @@ def stored_agent(path: Path) -> tuple[NetworkPolicy, dict[str, Any] | None]:
 
 
 def check_fit(path: Path, policy: NetworkPolicy, env_id: str, env_kwargs: dict[str, Any]) -> None:
-    """Check that an agent fits an environment.
-
-    Raises:
-        UsageError: if its observations have another size, or it was trained with another actuator.
-    """
+    """Check that an agent fits an environment."""
     env = evaluation.make_env(env_id, env_kwargs)
     size = env.observation_space.shape[0] if env.observation_space.shape else 0
     if policy.observation_size != size:
@@ -64,9 +56,6 @@ def velocity_feedback(env_id: str, env_kwargs: dict[str, Any], gain: float | Non
 def agent_of(name: str, env_id: str, *, gain: float | None = None, env_kwargs: dict[str, Any] | None = None) -> Policy:
     """Return the controller of an environment that --agent names: one of ``NAMED`` ("classical": the best tuned one), a
     run folder, a .npz or .onnx file, or module:NAME as :func:`imported_policy` takes it.
-
-    Raises:
-        ValueError: if there is no such agent, or it does not fit the environment.
     """
     if gain is not None and name != "velocity-feedback":
         raise UsageError(f"--gain goes with --agent velocity-feedback, not with {name!r}")

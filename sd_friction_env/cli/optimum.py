@@ -97,11 +97,7 @@ def _complete(options: argparse.Namespace) -> None:
 
 
 def _show(env_id: str, folder: Path) -> None:
-    """Print the stored refinement study: each grid's own estimate beside what was realised, then all stages.
-
-    Raises:
-        FileNotFoundError: if nothing is stored.
-    """
+    """Print the stored refinement study: each grid's own estimate beside what was realised, then all stages."""
     study = optimal.stored_study(env_id, folder)
     print(f"{env_id}: mean return {study['mean_return']:.4f} over {len(study['seeds'])} starts")
     print(f"computed by: {study['command']}\n")

@@ -86,11 +86,7 @@ def add_environment(parser: argparse._ActionsContainer, *, arguments: bool = Tru
 
 
 def named_environment(options: argparse.Namespace) -> str | None:
-    """Return the id of the environment that the options of :func:`add_environment` name, None if they name none.
-
-    Raises:
-        UsageError: if they name two, or one that does not exist.
-    """
+    """Return the id of the environment that the options of :func:`add_environment` name, None if they name none."""
     if options.env_id not in (None, *ENVIRONMENT_IDS):
         raise UsageError(f"--env-id must be one of {', '.join(ENVIRONMENT_IDS)}, got {options.env_id!r}")
     if options.env_id and (options.task or options.tier):
@@ -104,23 +100,21 @@ def named_environment(options: argparse.Namespace) -> str | None:
 
 
 def environment_of(options: argparse.Namespace) -> str:
-    """Return the id of the environment that the options of :func:`add_environment` name.
-
-    Raises:
-        UsageError: if they name none, two, or one that does not exist.
-    """
+    """Return the id of the environment that the options of :func:`add_environment` name."""
     found = named_environment(options)
     if found is None:
         raise UsageError(f"one of --task ({', '.join(TASKS)}) and --env-id is needed")
     return found
 
 
-def assignments(option: str, given: Sequence[str]) -> dict[str, Any]:
-    """Return NAME=VALUE arguments as a mapping, the values read as YAML (safely).
+def add_overrides(parser: argparse._ActionsContainer, what: str) -> None:
+    """Add --set, which says of one hyperparameter what is done with it."""
+    text = f"{what}, the value in YAML; may be repeated"
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="overrides", help=text)
 
-    Raises:
-        UsageError: if one is not of that form.
-    """
+
+def assignments(option: str, given: Sequence[str]) -> dict[str, Any]:
+    """Return NAME=VALUE arguments as a mapping, the values read as YAML (safely)."""
     values: dict[str, Any] = {}
     for text in given:
         name, equals, value = text.partition("=")
@@ -140,22 +134,14 @@ def command_line(options: argparse.Namespace) -> str:
 
 
 def check_at_least(options: argparse.Namespace, **lowest: int) -> None:
-    """Check whole-number options against their lowest values.
-
-    Raises:
-        UsageError: names the option, its value and the lowest one.
-    """
+    """Check whole-number options against their lowest values."""
     for name, low in lowest.items():
         if getattr(options, name) < low:
             raise UsageError(f"--{name.replace('_', '-')} must be at least {low}, got {getattr(options, name)}")
 
 
 def check_file(option: str, path: Path | None, *endings: str) -> None:
-    """Check that a file could be written: its ending and its folder.
-
-    Raises:
-        UsageError: if not.
-    """
+    """Check that a file could be written: its ending and its folder."""
     if path is None:
         return
     if endings:
@@ -186,11 +172,7 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
 
 
 def numbers(text: str) -> list[float]:
-    """Return the values of one argument: a number, or start:stop:step with both ends included.
-
-    Raises:
-        argparse.ArgumentTypeError: if it is neither.
-    """
+    """Return the values of one argument: a number, or start:stop:step with both ends included."""
     try:
         parts = [float(part) for part in text.split(":")]
     except ValueError:

@@ -13,6 +13,7 @@ from sd_friction_env.cli.options import (
     FailedError,
     UsageError,
     add_environment,
+    add_overrides,
     assignments,
     command_line,
     environment_of,
@@ -51,14 +52,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--timesteps", type=int, metavar="N", help="environment steps (default: the file's n_timesteps)")
     how.add_argument("--envs", type=int, metavar="N", help="environments side by side (default: the file's n_envs)")
     how.add_argument("--hyperparameters", type=Path, metavar="FILE", help="another file in RL Zoo's format")
-    how.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        dest="overrides",
-        help="replace one hyperparameter, the value in YAML; may be repeated",
-    )
+    add_overrides(how, "replace one hyperparameter")
     how.add_argument("--device", help="of torch: cpu, cuda or auto (default: cpu)")
     how.add_argument("--threads", type=int, help="of torch; more than 1 seldom pays here (default: 1)")
     out = parser.add_argument_group("what is written")
@@ -80,11 +74,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _planned(options: argparse.Namespace) -> tuple[Any, bool, bool]:
-    """Return the plan, whether it goes on with a run, and whether that run is finished; sets ``options.run_folder``.
-
-    Raises:
-        ValueError, TypeError: if the options make no plan, or what is in the folder is not of this plan.
-    """
+    """Return the plan, whether it goes on with a run, and whether that run is finished; sets ``options.run_folder``."""
     settings = {name: getattr(options, name) for name in _SETTINGS if getattr(options, name) not in (None, [])}
     by_folder = options.resume and options.run_folder is not None and not settings
     if not by_folder and options.algo is None:

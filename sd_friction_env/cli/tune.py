@@ -8,6 +8,7 @@ from sd_friction_env.cli.options import (
     FailedError,
     UsageError,
     add_environment,
+    add_overrides,
     assignments,
     check_at_least,
     command_line,
@@ -40,14 +41,7 @@ def _add_tune(parser: argparse.ArgumentParser) -> None:
     add_environment(what)
     what.add_argument("--algo", choices=ALGORITHMS, required=True, help="algorithm")
     what.add_argument("--hyperparameters", type=Path, metavar="FILE", help="another file to search around")
-    what.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        dest="overrides",
-        help="fix one hyperparameter, which is then not searched, the value in YAML; may be repeated",
-    )
+    add_overrides(what, "fix one hyperparameter, which is then not searched")
     how = parser.add_argument_group("how")
     how.add_argument("--trials", type=int, required=True, metavar="N", help="of the study in all")
     how.add_argument("--timesteps", type=int, metavar="N", help="of each trial (default: the file's n_timesteps)")

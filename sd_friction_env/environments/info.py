@@ -190,11 +190,7 @@ class BatchInfo:
         return {"statistics": masked, "_statistics": mask, **plain}
 
     def final(
-        self,
-        info: Mapping[str, Any],
-        which: IntegerArray,
-        ends: Mapping[str, Any],
-        observations: NDArray[np.float32],
+        self, info: Mapping[str, Any], which: IntegerArray, ends: Mapping[str, Any], observations: NDArray[np.float32]
     ) -> dict[str, Any]:
         """Return the last observations and info of environments that are reset in the step that ends their episodes."""
         mask = self._mask(which)

@@ -96,9 +96,7 @@ class SDFrictionVecEnv(VecEnv):
         """Store the actions (num_envs, 1)."""
         self._actions = actions
 
-    def step_wait(
-        self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Step; return observations, rewards, dones and infos."""
         observations, rewards, terminated, truncated, info = self.envs.step(self._actions)
         self.batch_info = info

@@ -44,9 +44,6 @@ def save_checkpoint(path: Path, plan: Plan, model: BaseAlgorithm, run: Mapping[s
     Args:
         run: the state of its record, tensors and plain values.
         at_end: whether training is over, so that the replay buffer is no longer needed.
-
-    Raises:
-        OSError: if it cannot be written.
     """
     about = {"format": FORMAT, "plan": content_digest(plan.configuration()), "steps": model.num_timesteps, "run": run}
     save_tensors(path, about | _model_state(model, at_end=at_end))

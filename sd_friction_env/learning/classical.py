@@ -536,9 +536,6 @@ def classical_controllers(env_id: str, path: Path | None = None) -> dict[str, Po
 def best_controller(env_id: str) -> tuple[str, Policy]:
     """Return name and controller of an environment's best tuned one: by suppressed share, then by return, both in the
     validation episodes.
-
-    Raises:
-        NotTunedError, ValueError: as :func:`classical_controllers`.
     """
     controllers, gains = classical_controllers(env_id), stored_gains()[env_id.rpartition(":")[2]]
     best = max(controllers, key=lambda name: (gains[name]["suppressed"], gains[name]["validation_return"]))

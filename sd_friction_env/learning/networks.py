@@ -22,11 +22,7 @@ ALGORITHM_CLASSES: dict[str, type[BaseAlgorithm]] = {
 
 
 def policy_arguments(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``policy_kwargs`` as Stable-Baselines3 takes them.
-
-    Raises:
-        TypeError, ValueError: as :func:`parse_policy_kwargs`.
-    """
+    """Return ``policy_kwargs`` as Stable-Baselines3 takes them."""
     arguments = parse_policy_kwargs(policy_kwargs)
     if "activation_fn" in arguments:
         arguments["activation_fn"] = getattr(nn, arguments["activation_fn"])
@@ -36,11 +32,7 @@ def policy_arguments(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
 def build_policy(
     algorithm: str, observation_space: spaces.Box, action_space: spaces.Box, policy_kwargs: Mapping[str, Any]
 ) -> BasePolicy:
-    """Return an untrained policy of Stable-Baselines3.
-
-    Raises:
-        TypeError, ValueError: as :func:`parse_policy_kwargs`.
-    """
+    """Return an untrained policy of Stable-Baselines3."""
     policy_class = ALGORITHM_CLASSES[algorithm].policy_aliases["MlpPolicy"]
     return policy_class(observation_space, action_space, lambda _: 0.0, **policy_arguments(policy_kwargs))
 

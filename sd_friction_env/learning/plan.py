@@ -142,7 +142,7 @@ def make_plan(
         implementation=implementation or (FAST if (algorithm, device) == _FAST_FOR else PLAIN),
         start_from=start_from,
     )
-    return _checked(plan)
+    return checked_plan(plan)
 
 
 def plan_of(config: Mapping[str, Any]) -> Plan:
@@ -167,12 +167,12 @@ def plan_of(config: Mapping[str, Any]) -> Plan:
             implementation=config.get("implementation", PLAIN),
             start_from=config.get("start_from"),
         )
-        return _checked(plan)
+        return checked_plan(plan)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunFolderError(f"the run's {CONFIG} cannot be used: {one_line(error)}") from None
 
 
-def _checked(plan: Plan) -> Plan:
+def checked_plan(plan: Plan) -> Plan:
     """Return a plan whose hyperparameters are checked one by one already, after checking the rest."""
     kwargs = _checked_environment(plan.env_id, plan.env_kwargs)
     _check_device(plan.device)

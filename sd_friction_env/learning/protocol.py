@@ -93,9 +93,6 @@ def measure(policy: Policy, name: str, env_id: str, progress: Callable[[], None]
 
     Args:
         policy: to be evaluated. name: for messages. env_id: of the environment. progress: called after each decision.
-
-    Raises:
-        EntryError: as :meth:`Checked.predict`.
     """
     checked = Checked(policy, name, env_id, progress)
     table = evaluation.evaluate(checked, env_id, SEEDS)
@@ -150,11 +147,7 @@ def resumed(entry: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def write_entry(entry: Mapping[str, Any], path: Path) -> None:
-    """Write an entry as a sealed file, whole or not at all.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+    """Write an entry as a sealed file, whole or not at all."""
     environments: dict[str, Any] = {}
     first: dict[str, Any] = {}
     for env_id, result in entry["environments"].items():

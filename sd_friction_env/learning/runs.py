@@ -111,11 +111,7 @@ def only_here(folder: Path) -> Iterator[None]:
 
 
 def begin(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> Path:
-    """Make the partial folder of a run with its unfinished config.json, and return it.
-
-    Raises:
-        RunFolderError: as :func:`check_free`.
-    """
+    """Make the partial folder of a run with its unfinished config.json, and return it."""
     check_free(folder, force=force)
     partial = partial_folder(folder)
     # Made under another name and renamed: a partial folder has its config.json even if this process is killed.

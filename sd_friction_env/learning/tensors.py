@@ -28,11 +28,7 @@ class _Writer:
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
-    """Write tensors and plain values as a sealed file.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+    """Write tensors and plain values as a sealed file."""
     import torch
 
     with sealed_archive(path) as file:

@@ -166,11 +166,7 @@ class _Labels:
             return UNDECIDED
 
     def classify(
-        self,
-        x: NDArray[np.float64],
-        v: NDArray[np.float64],
-        labels: NDArray[np.int8],
-        turnings: int = _MOST_TURNINGS,
+        self, x: NDArray[np.float64], v: NDArray[np.float64], labels: NDArray[np.int8], turnings: int = _MOST_TURNINGS
     ) -> None:
         """Write the labels of the starts (x, v), (n,) each."""
         kernel.classify(self.parameters.plant, self.parameters.belt_speed, x, v, *self._known, turnings, labels)

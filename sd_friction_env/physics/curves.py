@@ -50,11 +50,7 @@ def _row(cycle: LimitCycle) -> dict[str, Any]:
 
 
 def amplitude_curve(
-    parameters: OscillatorParameters,
-    belt_speeds: ArrayLike,
-    *,
-    x: float = 0.0,
-    v: float | None = None,
+    parameters: OscillatorParameters, belt_speeds: ArrayLike, *, x: float = 0.0, v: float | None = None
 ) -> Table:
     """Return the attractor at each belt speed: one row each, in the order given.
 

@@ -70,11 +70,7 @@ class Table(dict[str, NDArray[Any]]):
         return pd.DataFrame(dict(self))
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write the table, whole or not at all: comment lines "# key: value" with the metadata, a header, the rows.
-
-        Raises:
-            OSError: if the file cannot be written.
-        """
+        """Write the table, whole or not at all: comment lines "# key: value" with the metadata, a header, the rows."""
         with atomic_file(path) as file:
             self.write(file)
 

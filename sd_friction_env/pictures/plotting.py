@@ -41,12 +41,6 @@ FAMILY = (
     {"color": BLACK, "marker": "D"},
 )
 LINES = {"stick-slip": "-", "pure-slip": (0, (3, 1)), "steady-slip": (0, (1, 1.5))}  # of a family's members
-# Small and solid over large and hollow, so that neither hides the other.
-CONTROLLED = (
-    {"marker": "o", "markersize": 4.0, "color": GREEN, "zorder": 4},
-    {"marker": "s", "markersize": 8.5, "color": GREEN, "markerfacecolor": "none", "markeredgewidth": 1.5, "zorder": 3},
-    {"marker": "^", "markersize": 11.0, "color": GREEN, "markerfacecolor": "none", "zorder": 3},
-)
 WAYS = {"up": ORANGE, "down": BLACK}
 REGIONS = {
     "stick-slip": "#A6CEE3",
@@ -184,42 +178,6 @@ def mark_critical_speeds(axis: "Axes", v_b0: float, v_b1: float) -> None:
             axis.axvline(speed, color="0.45", linewidth=0.9, linestyle=(0, (6, 3)))
             above = axis.get_xaxis_transform()
             axis.text(speed, 1.01, label, transform=above, va="bottom", ha=side, fontsize=8, color="0.3")
-
-
-@house_style()
-def draw_controlled_points(axis: "Axes", series: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> None:
-    """Lay closed-loop amplitudes over a passive curve: (belt speeds, amplitudes) by name."""
-    for style, (name, (speeds, amplitudes)) in zip(CONTROLLED, series.items(), strict=False):
-        axis.plot(speeds, amplitudes, linestyle="none", label=name, **style)  # type: ignore[arg-type]
-
-
-@house_style()
-def draw_before_and_after(histories: Mapping[str, Trajectory], switched_on: float, title: str) -> "Figure":
-    """Draw displacement, velocity and phase portrait of controlled histories, control starting at ``switched_on``.
-
-    Args:
-        histories: one row of panels each, by name. switched_on: time at which control begins. title: of the figure.
-    """
-    figure, axes = new_figure(11.0, 2.9 * len(histories), len(histories), 3, width_ratios=(2.2, 2.2, 1.6))
-    figure.suptitle(title)
-    for row, (name, history) in zip(axes, histories.items(), strict=True):
-        t, x, v, belt = history.t, history.x, history.v, history.v_belt
-        before = t <= switched_on
-        for axis, values, label in ((row[0], x, r"displacement $x$"), (row[1], v, r"velocity $\dot x$")):
-            axis.axvspan(switched_on, t[-1], color="0.95", zorder=0)
-            axis.plot(t[before], values[before], color=GREY, linewidth=1.4)
-            axis.plot(t[~before], values[~before], color=GREEN, linewidth=1.4)
-            axis.set(xlabel=r"time $\tau$", ylabel=label)
-            axis.margins(x=0)
-        row[0].set_title(name, loc="left", fontsize=10)
-        row[1].plot(t, belt, color=BLACK, linewidth=1.0, linestyle=(0, (4, 2)), label=r"belt $v_b$")
-        row[1].legend(loc="lower right", fontsize=8, frameon=False)
-        row[2].plot(x[before], v[before], color=GREY, linewidth=1.2, label="passive")
-        row[2].plot(x[~before], v[~before], color=GREEN, linewidth=1.2, label="controlled")
-        row[2].plot(x[-1:], v[-1:], marker="o", color=BLACK, markersize=5, linestyle="none", label="end")
-        row[2].set(xlabel=r"$x$", ylabel=r"$\dot x$")
-        row[2].legend(loc="lower left", fontsize=8, frameon=False)
-    return figure
 
 
 @house_style()

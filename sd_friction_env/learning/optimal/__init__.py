@@ -16,12 +16,7 @@ an upper bound. So have the open tiers "blind" and "blind-late" those of the ran
 changes during an episode, stage 1 is that of the plant at the start, and the later stages know the changes to come.
 """
 
-from sd_friction_env.learning.optimal.grid import (
-    ValueFunction,
-    grid_actions,
-    make_grid,
-    value_iteration,
-)
+from sd_friction_env.learning.optimal.grid import ValueFunction, grid_actions, make_grid, value_iteration
 from sd_friction_env.learning.optimal.policy import OptimalPolicy, save_value
 from sd_friction_env.learning.optimal.problem import OPEN, RANDOMISED, SENSED, TASKS, Problem, make_problem
 from sd_friction_env.learning.optimal.refinement import refine, settle

@@ -26,12 +26,7 @@ from sd_friction_env.learning.optimal.stored import (
     value_path,
 )
 from sd_friction_env.physics.parameters import OscillatorParameters, checked_count, checked_number
-from sd_friction_env.storage import (
-    load_arrays,
-    parse_json,
-    predecessor_hint,
-    save_arrays,
-)
+from sd_friction_env.storage import load_arrays, parse_json, predecessor_hint, save_arrays
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,11 +10,7 @@ from sd_friction_env.learning.optimal.problem import Array, Problem, Progress, s
 
 
 def greedy_actions(
-    problem: Problem,
-    value: ValueFunction,
-    progress: Progress = silent,
-    count: int = 41,
-    prefix: Array | None = None,
+    problem: Problem, value: ValueFunction, progress: Progress = silent, count: int = 41, prefix: Array | None = None
 ) -> Array:
     """Return the action sequences that look one step ahead on the true dynamics, shape (n, steps).
 

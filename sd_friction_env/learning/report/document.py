@@ -236,11 +236,7 @@ class Report:
         }
 
     def write(self, folder: Path, origin: str) -> list[Path]:
-        """Write tables, pictures and page into a folder, all of them or none; return the files.
-
-        Raises:
-            OSError: if they cannot be written.
-        """
+        """Write tables, pictures and page into a folder, all of them or none; return the files."""
         contents = {f"{name}.png": data for name, (data, _) in self.pictures.items()}
         tables, page = self.tables(), self.html(origin)
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -19,8 +19,8 @@ from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from sd_friction_env.learning import training
-from sd_friction_env.learning.plan import Plan, make_plan
-from sd_friction_env.learning.settings import checked_whole
+from sd_friction_env.learning.plan import Plan, checked_plan, make_plan
+from sd_friction_env.learning.settings import check_hyperparameters, checked_whole
 from sd_friction_env.learning.tuning.space import Dimension, search_space
 from sd_friction_env.physics.parameters import checked_choice
 from sd_friction_env.storage import content_digest
@@ -49,14 +49,12 @@ class Search:
     Attributes:
         plan: of the hyperparameters around which the search is, with the search's seed.
         evaluations: of a trial, evenly spread. space: what is searched. pruner: one of ``PRUNERS``.
-        hyperparameter_file: that the plan was read from; None: the one shipped.
     """
 
     plan: Plan
     evaluations: int
     space: tuple[Dimension, ...]
     pruner: str
-    hyperparameter_file: Path | None
 
     def configuration(self) -> dict[str, Any]:
         """Return the search as JSON values: two searches may share a study if these are the same."""
@@ -81,18 +79,8 @@ class Search:
         settings = copy.deepcopy(dict(self.plan.hyperparameters))
         for dimension in self.space:
             dimension.put(settings, values[dimension.name])
-        return make_plan(
-            self.plan.env_id,
-            self.plan.algorithm,
-            env_kwargs=self.plan.env_kwargs,
-            overrides=settings,
-            hyperparameter_file=self.hyperparameter_file,
-            seed=seed,
-            eval_freq=self.plan.eval_freq,
-            eval_episodes=self.plan.eval_episodes,
-            device=self.plan.device,
-            threads=self.plan.threads,
-        )
+        settings = check_hyperparameters(self.plan.algorithm, settings)
+        return checked_plan(dataclasses.replace(self.plan, hyperparameters=settings, seed=seed))
 
 
 def derived_seed(*words: int) -> int:
@@ -120,13 +108,8 @@ def make_search(
     space = search_space(algorithm, centre.hyperparameters, list(plan.get("overrides") or {}))
     if not space:
         raise ValueError("nothing is left to be searched: every hyperparameter of the search space is fixed")
-    return Search(
-        plan=dataclasses.replace(centre, eval_freq=centre.steps // evaluations),
-        evaluations=evaluations,
-        space=space,
-        pruner=pruner,
-        hyperparameter_file=plan.get("hyperparameter_file"),
-    )
+    centre = dataclasses.replace(centre, eval_freq=centre.steps // evaluations)
+    return Search(plan=centre, evaluations=evaluations, space=space, pruner=pruner)
 
 
 def _pruner(search: Search) -> BasePruner:

@@ -206,8 +206,7 @@ def json_text(content: Mapping[str, Any], indent: int | None) -> str:
 def write_json(path: PathLike, content: Mapping[str, Any], *, indent: int | None = 2, keep: bool = False) -> None:
     """Write an object as a JSON file with its seal, whole or not at all.
 
-    Args:
-        indent: see :func:`json_text`. keep: see :func:`atomic_file`.
+    Raises:
         ValueError: if a number is not finite, or it would be too large to be read again.
     """
     unsealed = {name: value for name, value in content.items() if name != _SEAL_KEY}
@@ -432,14 +431,7 @@ def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any]], *, compress
 def save_arrays(
     path: PathLike, arrays: Mapping[str, NDArray[Any]], *, compress: bool = False, keep: bool = False
 ) -> None:
-    """Write arrays as a sealed .npz file, whole or not at all.
-
-    Args:
-        keep: see :func:`atomic_file`.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+    """Write arrays as a sealed .npz file, whole or not at all."""
     with sealed_archive(path, keep=keep) as file:
         write_arrays(file, arrays, compress=compress)
 

@@ -78,11 +78,6 @@ class _Group(NamedTuple):
 class Episodes:
     """Running episodes of a batch.
 
-    Args:
-        nominal, task: as of :class:`SDFrictionEnv`.
-        num_envs: how many environments.
-        threads: how many threads may share a step.
-
     Attributes:
         observations: (num_envs, size), float32, of the last step or reset.
         counts: whole numbers of the episodes, rows as in :mod:`sd_friction_env.kernel.rows`.

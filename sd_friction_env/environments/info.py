@@ -110,14 +110,7 @@ class Buffers(NamedTuple):
 
 
 class BatchInfo:
-    """Info of a batch: arrays (num_envs,) by name, and beside each "name" a mask "_name".
-
-    Args:
-        num_envs: how many environments.
-        width: number of columns of the kernel's arrays.
-        keys: names that a step's info holds.
-        needed: other names that the kernel reports, for the reward function or for pictures.
-    """
+    """Info of a batch: arrays (num_envs,) by name, and beside each "name" a mask "_name"."""
 
     def __init__(self, num_envs: int, width: int, keys: frozenset[str], needed: Collection[str]) -> None:
         self._arguments = (num_envs, width, keys, needed)

@@ -110,9 +110,6 @@ def control_jacobians(
     """Return the derivatives of (x, v, v_belt, reward) by (x, v, v_belt, action), (..., 4, 4).
 
     They are exact, the times of events included; NaN where a step cannot be followed.
-
-    Args:
-        plant, actuator, states, actions: as :func:`control_steps` takes them.
     """
     n, rows = actions.size, len(kernel.OUTCOMES)
     starts = np.empty((4, n))

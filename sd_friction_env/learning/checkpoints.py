@@ -124,9 +124,6 @@ def _restore_model(model: BaseAlgorithm, saved: Mapping[str, Any], steps: int) -
     """Put an untrained model and its environments into the state that :func:`_model_state` returned.
 
     Noises of actions are reset when learning starts: call :func:`restore_noises` then.
-
-    Args:
-        steps: of the whole run.
     """
     agent: Any = model
     model.set_parameters(saved["parameters"])

@@ -495,10 +495,6 @@ def keep(env_id: str, name: str, found: Mapping[str, Any], path: Path | None = N
     Other entries stay unchanged, also if another process stores at the same time. The file is written whole or not at
     all, and its predecessor is kept as "NAME.previous".
 
-    Args:
-        env_id, name: of the environment and the controller. found: of :func:`tune`, with the command.
-        path: of the gains, as :func:`stored_gains` takes it.
-
     Raises:
         ValueError: if the file does not hold gains. OSError: if it cannot be written.
     """
@@ -519,9 +515,6 @@ def keep(env_id: str, name: str, found: Mapping[str, Any], path: Path | None = N
 
 def classical_controllers(env_id: str, path: Path | None = None) -> dict[str, Policy]:
     """Return the tuned controllers of an environment by name.
-
-    Args:
-        env_id: its id. path: of the gains, as :func:`stored_gains` takes it.
 
     Raises:
         NotTunedError: if none is stored for it. ValueError: if the file does not hold gains.

@@ -184,9 +184,6 @@ def _part(episodes: Episodes, passive: Episodes, first: int, prefix: str) -> dic
 def metrics(episodes: Episodes, passive: Episodes) -> Table:
     """Return a table with one row per episode.
 
-    Args:
-        episodes: to be evaluated. passive: of the same starts without control.
-
     Returns:
         ``seed``; ``return`` and its terms ``return_vibration``, ``return_effort``, ``return_stick``,
         ``return_contact_loss``; ``steps``; ``completed``; over the last half of the episode ``amplitude`` and
@@ -264,11 +261,7 @@ def evaluate(
 def decision_milliseconds(
     policy: Policy, env_id: str, env_kwargs: Mapping[str, Any] | None = None, decisions: int = 20
 ) -> float:
-    """Return the wall time in milliseconds of one decision for one environment: the median of several, after a first.
-
-    Args:
-        policy, env_id, env_kwargs: as :func:`run_episodes` takes them. decisions: measured, at least 1.
-    """
+    """Return the wall time in milliseconds of one decision for one environment: the median of several after one."""
     env = make_env(env_id, env_kwargs)
     observation, _ = env.reset(seed=VALIDATION_SEEDS[0])
     state, times = None, []

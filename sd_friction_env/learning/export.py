@@ -104,9 +104,6 @@ def build(policy: NetworkPolicy, env: SDFrictionEnv, about: dict[str, Any] | Non
     shape (n, 1). ``metadata_props`` hold the columns' names, the control interval, and the values that fill a new
     window.
 
-    Args:
-        policy: of the agent. env: that it controls. about: additional metadata (JSON values).
-
     Raises:
         ValueError: if the agent does not fit the environment.
     """

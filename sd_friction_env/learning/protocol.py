@@ -89,11 +89,7 @@ def decisions(env_id: str) -> int:
 
 
 def measure(policy: Policy, name: str, env_id: str, progress: Callable[[], None] = lambda: None) -> dict[str, Any]:
-    """Return the results of a policy in the protocol's episodes, as an entry holds them.
-
-    Args:
-        policy: to be evaluated. name: for messages. env_id: of the environment. progress: called after each decision.
-    """
+    """Return the results of a policy in the protocol's episodes, as an entry holds them."""
     checked = Checked(policy, name, env_id, progress)
     table = evaluation.evaluate(checked, env_id, SEEDS)
     milliseconds = evaluation.decision_milliseconds(checked, env_id, decisions=_TIMED)
@@ -117,9 +113,6 @@ def _fingerprint(env_id: str) -> dict[str, Any]:
 
 def new_entry(name: str, policy: str, knows: str = "") -> dict[str, Any]:
     """Return an entry without results.
-
-    Args:
-        name: of its rows. policy: what makes it, for :func:`differences`. knows: of the plant.
 
     Raises:
         ValueError: if the name is empty, or a text has several lines.
@@ -219,10 +212,6 @@ def check_environment(entry: Mapping[str, Any], env_id: str) -> None:
 def differences(entry: Mapping[str, Any], env_id: str, policy: Policy, episodes: int = len(SEEDS)) -> list[str]:
     """Return a line for each result of an entry that a policy does not reach again: an episode whose return differs by
     more than :data:`TOLERANCE` or that is suppressed on one side only, and the rms action over all episodes.
-
-    Args:
-        entry: of :func:`read_entry`. env_id: of one of its environments. policy: to run again. episodes: the first so
-            many.
 
     Raises:
         EntryError: as :func:`check_environment`. EntryError: as :meth:`Checked.predict`.

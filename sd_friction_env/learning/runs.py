@@ -60,9 +60,6 @@ def partial_folder(folder: Path) -> Path:
 def check_free(folder: Path, *, force: bool = False) -> None:
     """Raise unless a run may be written to ``folder``; nothing is written or removed.
 
-    Args:
-        folder: of the finished run. force: whether an existing run may be replaced.
-
     Raises:
         RunFolderError: if the name is not allowed, something else has it, or a run has it and ``force`` is not given.
     """
@@ -162,9 +159,6 @@ def remove_leftovers(partial: Path) -> None:
 
 def finish(folder: Path, config: Mapping[str, Any], *, force: bool = False) -> None:
     """Give a partial folder its digests, its status and its name.
-
-    Args:
-        folder: of the finished run. config: as :func:`load_config` will return it, without ``files``.
 
     Raises:
         RunFolderError: if something else has taken the name and ``force`` is not given.
@@ -267,9 +261,6 @@ def _read_config(place: Path) -> dict[str, Any]:
 
 def load_unfinished(folder: Path, *, force: bool = False) -> dict[str, Any]:
     """Return the configuration of the unfinished run that will become ``folder``; nothing is written.
-
-    Args:
-        folder: of the finished run. force: whether an existing finished run may be replaced in the end.
 
     Raises:
         RunFolderError: if there is none, it is finished, damaged, of another kind or format, or its name is taken.

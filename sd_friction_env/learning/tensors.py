@@ -1,5 +1,6 @@
 """Files of tensors and plain values (.pt): sealed, written whole or not at all, read without executing anything."""
 
+import io
 import sys
 import warnings
 from collections.abc import Mapping
@@ -9,36 +10,14 @@ from typing import Any
 from sd_friction_env.storage import StoredFileError, naming, open_archive, open_regular, sealed_archive
 
 
-class _Writer:
-    """Keeps the system's error, which torch.save turns into a bare RuntimeError."""
-
-    def __init__(self, file: Any) -> None:
-        self.file = file
-        self.error: OSError | None = None
-
-    def write(self, data: Any) -> int:
-        try:
-            return int(self.file.write(data))
-        except OSError as error:
-            self.error = error
-            raise
-
-    def flush(self) -> None:
-        self.file.flush()
-
-
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
     """Write tensors and plain values as a sealed file."""
     import torch
 
+    buffer = io.BytesIO()  # torch turns the system's errors into a bare RuntimeError
+    torch.save(dict(content), buffer)
     with sealed_archive(path) as file:
-        writer: Any = _Writer(file)
-        try:
-            torch.save(dict(content), writer)
-        except RuntimeError:
-            if writer.error is not None:
-                raise writer.error from None
-            raise
+        file.write(buffer.getbuffer())
 
 
 def load_tensors(path: Path, *, sealed: bool = False) -> dict[str, Any]:

@@ -343,11 +343,7 @@ def train(
 def _resume(
     plan: Plan, partial: Path, begun: Mapping[str, Any], model: BaseAlgorithm, config: dict[str, Any]
 ) -> tuple[Path, Mapping[str, Any]] | None:
-    """Restore a model from the last checkpoint of the run that was begun, and return that; None if it has none yet.
-
-    Args:
-        config: of the run, to which the record of being resumed is added.
-    """
+    """Restore a model from the last checkpoint of the run that was begun, and return that; None if it has none yet."""
     check_same(begun, plan, partial)
     found = checkpoints.last_whole_checkpoint(runs.checkpoints(partial))
     if found is None:

@@ -41,11 +41,7 @@ def greedy_actions(
 def look_ahead(
     step: Callable[[Array, Array], tuple[Array, Array]], value: Callable[[Array], Array], states: Array, count: int
 ) -> Array:
-    """Return the actions, shape (n,), that are best one step ahead in states of shape (n, 3).
-
-    Args:
-        step: of the plant. value: of states (..., 3), shape (...). count: actions tried at a time.
-    """
+    """Return the actions, shape (n,), that are best one step ahead in states of shape (n, 3)."""
     n = len(states)
     centre, width = np.zeros(n), 1.0
     for _ in range(3):
@@ -60,11 +56,7 @@ def look_ahead(
 def deeper(
     step: Callable[[Array, Array], tuple[Array, Array]], value: Callable[[Array], Array], states: Array, count: int
 ) -> Array:
-    """Return what states (..., 3) are worth, shape (...), looking one step further than a value function does.
-
-    Args:
-        step, value: as :func:`look_ahead` takes them. count: evenly spaced actions tried.
-    """
+    """Return what states (..., 3) are worth, shape (...), looking one step further than a value function does."""
     tried = np.broadcast_to(np.linspace(-1.0, 1.0, count), (*states.shape[:-1], count))
     ends, rewards = step(np.repeat(states[..., None, :], count, axis=-2), tried)
     worth: Array = (rewards + value(ends)).max(axis=-1)

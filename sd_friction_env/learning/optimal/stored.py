@@ -140,9 +140,6 @@ def save_optimum(
     """Store sequences, their returns and the fingerprint; return the returns of the sequences as stored, shape (n,).
 
     Existing files are kept as their predecessors, "NAME.previous".
-
-    Args:
-        actions: shape (n, steps). about: JSON values on how they were found.
     """
     levels = encode(actions)
     returns = problem.returns(decode(levels).astype(np.float64))

@@ -97,11 +97,7 @@ def over_runs(name: str, summaries: Sequence[Row], *, seed: int, resamples: int)
 
 
 def compare(key: Key, agents: Sequence[Agent], effort: Effort, seed: int) -> Comparison:
-    """Evaluate all controllers of a task and tier on the protocol's episodes.
-
-    Args:
-        agents: trained for this task and tier. seed: of the bootstraps.
-    """
+    """Evaluate all controllers of a task and tier on the protocol's episodes."""
     env_id, seeds = ENV_IDS[key], evaluation.EVALUATION_SEEDS[: effort.episodes]
     passive = evaluation.passive_episodes(env_id, seeds)
     passive_table = evaluation.metrics(passive, passive)

@@ -109,9 +109,6 @@ def training_times(agents: Sequence[Agent], passive: float, optimum: float) -> l
     """Return the duration of each run, and the seconds until its evaluations first reached a score (NaN: never).
 
     These evaluations are of the validation episodes; the score uses the means of the evaluation episodes.
-
-    Args:
-        agents: the runs. passive, optimum: mean returns.
     """
     rows: list[Row] = []
     for agent in agents:

@@ -84,11 +84,7 @@ def draw_sweeps(rows: Sequence[Row], task: str) -> "Figure":
 
 @plotting.house_style()
 def draw_learning(rows: Sequence[Row], references: Mapping[str, float]) -> "Figure":
-    """Draw the learning curves of one task and tier: lines are means over runs, bands their ranges.
-
-    Args:
-        references: returns to be marked, by name.
-    """
+    """Draw the learning curves of one task and tier: lines are means over runs, bands their ranges."""
     from matplotlib.ticker import EngFormatter
 
     figure, axes = plotting.new_figure(9.0, 6.2, 2, 2, sharex="col", sharey="row")

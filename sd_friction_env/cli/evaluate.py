@@ -56,6 +56,8 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--controller", nargs="+", default=[], choices=CONTROLLERS, help=text)
     parser.add_argument("--gain", type=float, help="of velocity-feedback (default: 1.5 on force, 1 on belt)")
     add_environment(parser)
+    text = "episodes on plants whose alpha, mu_m and belt_speed differ by this share from what controllers know"
+    parser.add_argument("--plant-error", type=float, metavar="SHARE", help=text)
     text = "the first N of the protocol's (default: all 100)"
     parser.add_argument("--episodes", type=int, default=100, metavar="N", help=text)
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the table")
@@ -123,18 +125,23 @@ def _evaluate(options: argparse.Namespace) -> int:
         for (env_id, kwargs_text), learned in _agents_by_environment(options).items():
             env_kwargs = json.loads(kwargs_text)
             beside = _controllers(options.controller, options.gain, env_id, env_kwargs)
-            passive = evaluation.passive_episodes(env_id, seeds, env_kwargs)
+            plants = None
+            if options.plant_error is not None:
+                env = evaluation.make_env(env_id, env_kwargs)
+                plants = evaluation.plants_off_nominal(env, len(seeds), options.plant_error)
+            passive = evaluation.passive_episodes(env_id, seeds, env_kwargs, plants)
             passive_table = evaluation.metrics(passive, passive)
-            optimal = evaluation.optimal_returns(env_id, seeds, env_kwargs)
+            optimal = None if plants else evaluation.optimal_returns(env_id, seeds, env_kwargs)
             rows = []
             for name, policy in {"passive": ZeroPolicy(), **beside, **learned}.items():
-                table = evaluation.evaluate(policy, env_id, seeds, env_kwargs, passive=passive)
+                table = evaluation.evaluate(policy, env_id, seeds, env_kwargs, passive=passive, options=plants)
                 row = evaluation.summarise(name, table, passive_table, optimal)
                 rows.append(row | {"ms": evaluation.decision_milliseconds(policy, env_id, env_kwargs)})
                 all_episodes.append((env_id, name, table))
             if optimal is not None:
                 rows.append({"controller": "optimum", "return": float(np.nanmean(optimal)), "score": 1.0})
             shown = f" with {kwargs_text}" if env_kwargs else ""
+            shown += f", plants {options.plant_error:.0%} off nominal" if plants else ""
             print(f"\n{env_id}{shown}, {len(seeds)} episodes")
             print(evaluation.format_summary(rows))
             all_rows += [{"env_id": env_id, **row} for row in rows]

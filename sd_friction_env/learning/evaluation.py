@@ -20,6 +20,7 @@ from sd_friction_env import SDFrictionEnv, SDFrictionVectorEnv, Table
 from sd_friction_env.control.policies import Policy, State, ZeroPolicy
 from sd_friction_env.learning import optimal
 from sd_friction_env.learning.scores import NO_INTERVAL, RESAMPLES, credited_score, score, score_interval
+from sd_friction_env.physics.parameters import checked_number
 from sd_friction_env.physics.starts import share_interval
 
 Array = NDArray[np.float64]
@@ -246,16 +247,38 @@ def evaluate(
     env_kwargs: Mapping[str, Any] | None = None,
     *,
     passive: Episodes | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Table:
     """Run one episode per seed and return the table of :func:`metrics`.
 
     Args:
-        policy, env_id, seeds, env_kwargs: as :func:`run_episodes` takes them.
+        policy, env_id, seeds, env_kwargs, options: as :func:`run_episodes` takes them.
         passive: the same episodes without control, if available (otherwise they are run, and cached).
     """
     if passive is None:
-        passive = passive_episodes(env_id, seeds, env_kwargs)
-    return metrics(run_episodes(policy, env_id, seeds, env_kwargs), passive)
+        passive = passive_episodes(env_id, seeds, env_kwargs, options)
+    return metrics(run_episodes(policy, env_id, seeds, env_kwargs, options), passive)
+
+
+def plants_off_nominal(env: SDFrictionEnv, n: int, error: float) -> dict[str, Any]:
+    """Return the reset's options for n episodes whose plants are not the nominal one that controllers know.
+
+    alpha, mu_m and belt_speed each differ from nominal by the share ``error``: the eight combinations of signs in turn.
+
+    Args:
+        env: of the nominal plant. n: number of episodes. error: in [0, 1).
+
+    Raises:
+        TypeError, ValueError: if the error is not such a number, or a plant would not be allowed.
+    """
+    error = checked_number("plant error", error, 0.0, 0.999)
+    plants = []
+    for i in range(n):
+        signs = {name: 1.0 - 2.0 * (i >> bit & 1) for bit, name in enumerate(("alpha", "mu_m", "belt_speed"))}
+        changes = {name: getattr(env.nominal, name) * (1.0 + sign * error) for name, sign in signs.items()}
+        env.nominal.replace(**changes)
+        plants.append(changes)
+    return {"parameters": {name: np.array([plant[name] for plant in plants]) for name in plants[0]}}
 
 
 def decision_milliseconds(
@@ -276,9 +299,14 @@ def decision_milliseconds(
 
 
 def passive_episodes(
-    env_id: str, seeds: Sequence[int] = EVALUATION_SEEDS, env_kwargs: Mapping[str, Any] | None = None
+    env_id: str,
+    seeds: Sequence[int] = EVALUATION_SEEDS,
+    env_kwargs: Mapping[str, Any] | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Episodes:
     """Return the episodes of :func:`run_episodes` without control."""
+    if options is not None:
+        return run_episodes(ZeroPolicy(), env_id, seeds, env_kwargs, options)
     try:
         key = json.dumps(dict(env_kwargs or {}), sort_keys=True)
     except TypeError:  # arguments that are no plain data, such as a reward function

@@ -203,6 +203,16 @@ def test_bad_arguments_are_refused_by_name():
         OptimalPolicy.from_env(env, depth=4)
 
 
-def test_evaluate_prints_the_time_of_a_decision(capsys):
-    assert main(["evaluate", "--task", "belt", "--episodes", "8", "--controller", "velocity-feedback"]) == 0
-    assert capsys.readouterr().out.splitlines()[2].endswith("   ms")
+def test_evaluate_prints_the_time_of_a_decision_and_plants_off_nominal(tmp_path, capsys):
+    file = tmp_path / "episodes.csv"
+    command = ["evaluate", "--task", "belt", "--episodes", "8", "--controller", "velocity-feedback"]
+    assert main([*command, "--plant-error", "0.1", "--episodes-csv", str(file)]) == 0
+    out = capsys.readouterr().out
+    assert "plants 10% off nominal, 8 episodes" in out
+    assert out.splitlines()[2].endswith("   ms")
+    plants = evaluation.plants_off_nominal(evaluation.make_env(BELT), 8, 0.1)["parameters"]
+    assert {tuple(np.round(row, 6)) for row in np.column_stack(list(plants.values()))} == {
+        (alpha, mu_m, v_b) for alpha in (0.72, 0.88) for mu_m in (0.045, 0.055) for v_b in (0.18, 0.22)
+    }
+    assert main([*command, "--plant-error", "-0.1"]) == 2
+    assert "plant error must be" in capsys.readouterr().err

@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Train as the command line says; return the exit status."""
     parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tier", nargs="+", choices=OPEN_TIERS, default=list(OPEN_TIERS), help="default: all")
-    parser.add_argument("--seed", type=int, nargs="+", default=[0, 1], help="default: 0 1")
+    parser.add_argument("--seed", type=int, nargs="+", default=[0], help="default: 0")
     parser.add_argument("--rounds", type=int, default=100, help="of 256 episodes and a fit (default: 100)")
     parser.add_argument("--out", type=Path, default=RECURRENT, help="folder (default: agents/recurrent)")
     options = parser.parse_args(arguments)

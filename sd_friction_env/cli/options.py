@@ -134,10 +134,11 @@ def command_line(options: argparse.Namespace) -> str:
 
 
 def check_at_least(options: argparse.Namespace, **lowest: int) -> None:
-    """Check whole-number options against their lowest values."""
+    """Check whole-number options, or lists of them, against their lowest values."""
     for name, low in lowest.items():
-        if getattr(options, name) < low:
-            raise UsageError(f"--{name.replace('_', '-')} must be at least {low}, got {getattr(options, name)}")
+        given = getattr(options, name)
+        if np.min(given) < low:
+            raise UsageError(f"--{name.replace('_', '-')} must be at least {low}, got {given}")
 
 
 def check_file(option: str, path: Path | None, *endings: str) -> None:

@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import NamedTuple
@@ -91,7 +91,7 @@ def _work(check: Check, seed: int, first: int, pipe: Connection) -> None:
             pipe.send(outcome(check, seed, index))
 
 
-def outcomes(check: Check, seed: int, first: int) -> Iterator[Outcome | None]:
+def outcomes(check: Check, seed: int, first: int) -> Generator[Outcome | None, None, None]:
     """Yield what becomes of trials from index ``first`` on, without end; None when a process is ready to begin.
 
     Raises:

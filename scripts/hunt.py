@@ -10,34 +10,123 @@ Ctrl-C ends the check that runs, prints what was found until then, and stops.
 """
 
 import argparse
+import contextlib
+import math
 import sys
 import time
 from collections import Counter
+from dataclasses import dataclass, field
 
-from scripts.hunting import against_scipy, environments, events, fuzz, motions, slow, steps
-from scripts.hunting.trials import Check, Failure, Findings, Interrupted, SetAside, hunt
+from scripts.hunting import against_scipy, environments, events, files, fuzz, labels, motions, steps
+from scripts.hunting.trials import Check, Failure, Outcome, SetAside, outcomes
 
 CHECKS = {
     check.name: check
     for check in (
         steps.CHECK,
-        slow.CHECK,
+        steps.SLOW,
         against_scipy.CHECK,
         events.CHECK,
         environments.BATCHES,
-        environments.INTERPRETED_CHECK,
+        environments.INTERPRETED,
         environments.INFOS,
         motions.ATTRACTORS,
         motions.MULTIPLIERS,
-        motions.LABELS,
-        motions.FILES,
+        labels.CHECK,
+        files.CHECK,
         fuzz.LEGAL,
         fuzz.ARGUMENTS,
         fuzz.COMMANDS,
     )
 }
 _SHOWN = 5  # failures of each kind
-_MOST_SLOW = 20  # trials that had to be ended, before a check is left
+_MOST_ENDED = 20  # trials that had to be ended, before a check is left
+
+
+@dataclass
+class Findings:
+    """What became of a check's trials: ``failures`` and ``greatest`` numbers with their index."""
+
+    tried: int = 0
+    held: int = 0
+    ended: int = 0
+    aside: Counter[str] = field(default_factory=Counter)
+    failures: dict[int, str] = field(default_factory=dict)
+    greatest: dict[str, tuple[float, int]] = field(default_factory=dict)
+
+    def add(self, found: Outcome) -> None:
+        """Count one trial."""
+        self.tried += 1
+        self.held += found.kind == "held"
+        self.ended += found.ended
+        if found.kind == "aside":
+            self.aside[found.words] += 1
+        elif found.kind == "failed":
+            self.failures[found.number] = found.words
+        for name, value in found.numbers.items():
+            if not value <= self.greatest.get(name, (-1.0, 0))[0]:
+                self.greatest[name] = value, found.number
+
+    def show(self, check: Check, seed: int) -> None:
+        """Print what became of a check."""
+        print(f"\n{check.name}: {check.title}")
+        print(f"  tried {self.tried}, held {self.held}, failed {len(self.failures)}")
+        for reason, count in self.aside.most_common():
+            print(f"  set aside: {count} ({reason})")
+        for name, (value, index) in self.greatest.items():
+            print(f"  {name}: {value:.3g} ({check.name}-{seed}-{index})")
+        for kind, count in Counter(map(kind_of, self.failures.values())).most_common():
+            print(f"  failed: {count} ({kind})")
+            for index, words in [each for each in sorted(self.failures.items()) if kind_of(each[1]) == kind][:_SHOWN]:
+                print(f"    FAILED {check.name}-{seed}-{index}: {words}")
+        sys.stdout.flush()
+
+
+def kind_of(words: str) -> str:
+    """Return the kind of a failure, the part of its words in brackets."""
+    return words[1 : words.index("]")]
+
+
+def hunt(check: Check, seed: int, first: int, count: float, seconds: float) -> tuple[Findings, bool]:
+    """Run trials of a check from index ``first`` on, until ``count`` are done, ``seconds`` are over or too many had to
+    be ended; return the findings, and whether the user stopped it."""
+    findings, begun = Findings(), math.inf
+    with contextlib.closing(outcomes(check, seed, first)) as found:
+        try:
+            while findings.tried < count and time.monotonic() - begun < seconds and findings.ended < _MOST_ENDED:
+                each = next(found)
+                begun = min(begun, time.monotonic())  # the time to compile does not count
+                if each is not None:
+                    findings.add(each)
+                if sys.stderr.isatty():
+                    print(
+                        f"\r{check.name}: {findings.tried} tried, {len(findings.failures)} failed",
+                        end="\r",
+                        file=sys.stderr,
+                    )
+        except KeyboardInterrupt:
+            print("\ninterrupted", file=sys.stderr)
+            return findings, True
+    return findings, False
+
+
+def replay(name: str) -> int:
+    """Run one trial in this process; return the exit status."""
+    check, seed, index = ["", "", "", *name.rsplit("-", 2)][-3:]
+    if check not in CHECKS or not (seed.isdigit() and index.isdigit()):
+        print(f"--replay must be CHECK-SEED-INDEX with a check of {', '.join(CHECKS)}, got {name!r}", file=sys.stderr)
+        return 2
+    chosen = CHECKS[check]
+    print(chosen.drawn(int(seed), int(index)), flush=True)
+    chosen.prepare()
+    try:
+        print(f"held {dict(chosen.trial(int(seed), int(index)) or {})}")
+    except SetAside as reason:
+        print(f"set aside: {reason}")
+    except Failure as found:
+        print(f"FAILED: {found}")
+        return 1
+    return 0
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -56,76 +145,14 @@ def main(arguments: list[str] | None = None) -> int:
     shares = sum(check.share for check in checks)
     failed = 0
     for check in checks:
-        seconds = None if chosen.plants else 60.0 * chosen.minutes * check.share / shares
-        begun = time.monotonic()
-        show = Progress(check)
-        try:
-            findings = hunt(check, chosen.seed, chosen.first, chosen.plants, seconds, _MOST_SLOW, show)
-        except Interrupted as stop:
-            tell(check, chosen.seed, stop.findings, time.monotonic() - begun)
+        seconds = math.inf if chosen.plants else 60.0 * chosen.minutes * check.share / shares
+        findings, interrupted = hunt(check, chosen.seed, chosen.first, chosen.plants or math.inf, seconds)
+        findings.show(check, chosen.seed)
+        if interrupted:
             return 1
-        tell(check, chosen.seed, findings, time.monotonic() - begun)
         failed += len(findings.failures)
     print(f"\n{failed} failed" if failed else "\nall held")
     return 1 if failed else 0
-
-
-class Progress:
-    """Shows on a terminal how far a check is."""
-
-    def __init__(self, check: Check) -> None:
-        self._name = check.name
-        self._next = 0.0
-
-    def __call__(self, findings: Findings) -> None:
-        if sys.stderr.isatty() and time.monotonic() > self._next:
-            self._next = time.monotonic() + 1.0
-            print(f"\r{self._name}: {findings.tried} tried, {len(findings.failures)} failed", end="\r", file=sys.stderr)
-
-
-def tell(check: Check, seed: int, findings: Findings, seconds: float) -> None:
-    """Print what became of a check."""
-    failures = findings.failures
-    print(f"\n{check.name}: {check.title}")
-    print(f"  tried {findings.tried}, held {findings.held}, failed {len(failures)} ({seconds:.0f} s)")
-    for reason, count in findings.aside.most_common():
-        print(f"  set aside: {count} ({reason})")
-    for name, (value, index) in findings.greatest.items():
-        print(f"  {name}: {value:.3g} ({check.name}-{seed}-{index})")
-    for kind, count in Counter(map(kind_of, failures.values())).most_common():
-        print(f"  failed: {count} ({kind})")
-        for index, words in [entry for entry in sorted(failures.items()) if kind_of(entry[1]) == kind][:_SHOWN]:
-            print(f"    FAILED {check.name}-{seed}-{index}: {words}")
-        if count > _SHOWN:
-            print(f"    and {count - _SHOWN} more")
-    sys.stdout.flush()
-
-
-def kind_of(words: str) -> str:
-    """Return the kind of a failure, the part of its words in brackets."""
-    return words[1 : words.index("]")]
-
-
-def replay(name: str) -> int:
-    """Run one trial in this process; return the exit status."""
-    check, seed, index = ["", "", "", *name.rsplit("-", 2)][-3:]
-    if check not in CHECKS or not (seed.isdigit() and index.isdigit()):
-        print(f"--replay must be CHECK-SEED-INDEX with a check of {', '.join(CHECKS)}, got {name!r}", file=sys.stderr)
-        return 2
-    chosen = CHECKS[check]
-    if chosen.drawn is not None:
-        print(chosen.drawn(int(seed), int(index)), flush=True)
-    chosen.prepare()
-    try:
-        numbers = chosen.trial(int(seed), int(index))
-    except SetAside as reason:
-        print(f"set aside: {reason}")
-    except Failure as found:
-        print("\n".join([f"FAILED: {found}", *getattr(found, "__notes__", [])]))
-        return 1
-    else:
-        print(f"held {dict(numbers or {})}")
-    return 0
 
 
 if __name__ == "__main__":

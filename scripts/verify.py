@@ -5,7 +5,6 @@
     python scripts/verify.py --also basins          a million starts, twice (half a minute)
     python scripts/verify.py --also curves          960 points of curves against SciPy (ten minutes)
     python scripts/verify.py --also oracle          random oscillators against SciPy (ten minutes)
-    python scripts/verify.py --also steps           random environment steps, checked for faults
 
 Exit status 1 if a number misses its bound.
 """
@@ -276,33 +275,6 @@ def against_oracle(report: Report, draws: int = 100) -> None:
     report.below(f"worst gap ({amplified} that amplify set apart)", worst, 1e-6)
 
 
-def soak(report: Report, steps: int = 1_000_000) -> None:
-    """Random environment steps over random oscillators, checked for NaN, hangs and broken rules."""
-    report.head(f"{steps:,} random environment steps")
-    ranges = {"alpha": (0.1, 1.2), "belt_speed": (0.02, 0.6), "mu_m": (0.0, 0.2), "beta": (0.0, 0.2)}
-    env = SDFrictionEnv(actuator="belt_speed", start="random", randomise=ranges)
-    rng = np.random.default_rng(1)
-    env.reset(seed=0)
-    faults = events = lost = 0
-    for action in rng.uniform(-1.0, 1.0, (steps, 1)):
-        observation, reward, terminated, truncated, info = env.step(action)
-        events += info["events"]
-        fine = math.isfinite(float(reward)) and np.abs(observation[:2]).max() <= 10.0
-        if info["mode"] == kernel.STICK:
-            plant = env.parameters.plant
-            drive = kernel.Drive(info["v_belt"], info["belt_acceleration"], info["force"])
-            load = kernel.stick_load(plant, info["x"], drive)
-            limit = kernel.stick_limit(plant, kernel.SLIP_BACKWARD, info["x"])
-            fine = fine and info["v_rel"] == 0.0 and abs(load) <= limit * (1.0 + 1e-9) + 1e-12
-        else:
-            fine = fine and info["mode"] * info["v_rel"] >= 0.0
-        faults += not (fine and info["status"] in (kernel.OK, kernel.CONTACT_LOST))
-        lost += terminated
-        if terminated or truncated:
-            env.reset()
-    report.below(f"faults ({events:,} events, {lost:,} episodes lost contact)", faults, 0.0)
-
-
 def timed(work: Callable[[], object], repeats: int = 3) -> float:
     """Return the median time of some runs, in seconds."""
     times = []
@@ -450,7 +422,6 @@ SECTIONS: dict[str, Callable[[Report], None]] = {
     "basins": million_starts,
     "curves": curves,
     "oracle": against_oracle,
-    "steps": soak,
 }
 ALWAYS = ("published", "linear", "laws", "energy")
 

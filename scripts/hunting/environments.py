@@ -21,7 +21,7 @@ from sd_friction_env.physics.parameters import RANGES, SMALLEST_ALPHA
 SIZES = (1, 3, 300, 1100)  # of the last two threads take a share each
 STEPS = 7
 LANES = 12  # of a batch that are compared, its ends among them
-INTERPRETED = 3  # tasks in one interpreted process
+TASKS = 3  # in one interpreted process
 _MOMENT = ("v_belt", "v_rel", "normal_force", "time")
 _INTEGRALS = ("x_min", "x_max", "mean_square_velocity", "stick_fraction", "friction_power", "control_power")
 _REWARDS = ("reward_vibration", "reward_effort", "reward_stick", "reward_contact_loss")
@@ -114,17 +114,12 @@ def bits(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def row_of(
-    observation: Any, info: Mapping[str, Any], reward: float = 0.0, terminated: bool = False, truncated: bool = False
-) -> dict[str, Any]:
-    """Return what a reset or a step of one environment gives, by name."""
-    return {
-        "observation": observation,
-        "info": info,
-        "reward": float(reward),
-        "terminated": bool(terminated),
-        "truncated": bool(truncated),
-    }
+def row_of(observation: Any, *rest: Any) -> dict[str, Any]:
+    """Return what a reset (observation, info) or a step of one environment gives, by name."""
+    *judged, info = rest
+    reward, terminated, truncated = judged or (0.0, False, False)
+    ends = {"terminated": bool(terminated), "truncated": bool(truncated)}
+    return {"observation": observation, "info": info, "reward": float(reward), **ends}
 
 
 def single_rollout(made: Episode, lane: int, mode: str) -> list[dict[str, Any]]:
@@ -140,11 +135,10 @@ def single_rollout(made: Episode, lane: int, mode: str) -> list[dict[str, Any]]:
             rows.append(row_of(*env.reset()))
             over = False
             continue
-        observation, reward, terminated, truncated, info = env.step(np.array([action]))
-        row = row_of(observation, info, float(reward), terminated, truncated)
-        over = terminated or truncated
+        row = row_of(*env.step(np.array([action])))
+        over = row["terminated"] or row["truncated"]
         if over and mode != "NextStep":
-            row["final"] = {"observation": observation, "info": info}
+            row["final"] = {"observation": row["observation"], "info": row["info"]}
             row["observation"], row["info"] = env.reset()
             over = False
         rows.append(row)
@@ -174,7 +168,7 @@ def batch_rollout(made: Episode, lanes: list[int], mode: str, threads: int) -> l
         if mode == "Disabled" and over.any():
             restarted = env.reset(options={"reset_mask": over})
         for place, i in enumerate(lanes):
-            row = row_of(observations[i], lane_of(info, i), rewards[i], terminated[i], truncated[i])
+            row = row_of(observations[i], rewards[i], terminated[i], truncated[i], lane_of(info, i))
             if over[i] and mode == "SameStep":
                 row["final"] = {"observation": row["info"].pop("final_obs"), "info": row["info"].pop("final_info")}
             elif over[i] and mode == "Disabled":
@@ -198,25 +192,38 @@ def first_gap(single: list[dict[str, Any]], other: list[dict[str, Any]]) -> str:
     return ""
 
 
-def batch_trial(seed: int, index: int) -> None:
-    """Compare the single environment with a batch, bit for bit."""
+class Batch(NamedTuple):
+    """What a trial of batches compares: an episode, the lanes that are looked at, autoreset mode and threads."""
+
+    made: Episode
+    lanes: list[int]
+    mode: str
+    threads: int
+
+
+def drawn_batch(seed: int, index: int) -> Batch:
+    """Return the batch of a trial."""
     rng = draws.generator(seed, index)
     size = int(rng.choice(SIZES, p=[0.35, 0.35, 0.2, 0.1]))
     mode = str(rng.choice(["NextStep", "SameStep", "Disabled"]))
     threads = 1 + int(rng.random() < 0.5)
     made = episode(rng, size, longest=0.3)
-    lanes = sorted({0, size - 1, *rng.integers(0, size, LANES - 2).tolist()})
-    how = f"{size} environments, lane {{lane}}, {mode}, {threads} threads, seed {made.seed}"
-    try:
-        batch = batch_rollout(made, lanes, mode, threads)
-        for place, lane in enumerate(lanes):
-            gap = first_gap(single_rollout(made, lane, mode), batch[place])
-            if gap:
-                start = made.starts[lane] if made.starts else {}
-                raise Failure("batch", f"{gap}\n      {how.format(lane=lane)}, options {start}")
-    except Exception as error:
-        error.add_note(made.described())
-        raise
+    return Batch(made, sorted({0, size - 1, *rng.integers(0, size, LANES - 2).tolist()}), mode, threads)
+
+
+def described_batch(seed: int, index: int) -> str:
+    """Return the call that makes the environment of a trial."""
+    return drawn_batch(seed, index).made.described()
+
+
+def batch_trial(seed: int, index: int) -> None:
+    """Compare the single environment with a batch, bit for bit."""
+    made, lanes, mode, threads = drawn_batch(seed, index)
+    for lane, rows in zip(lanes, batch_rollout(made, lanes, mode, threads), strict=True):
+        gap = first_gap(single_rollout(made, lane, mode), rows)
+        if gap:
+            how = f"{made.actions.shape[1]} environments, lane {lane}, {mode}, {threads} threads, seed {made.seed}"
+            raise Failure("batch", f"{gap}\n      {how}, options {made.starts[lane] if made.starts else {}}")
 
 
 def interpreted_trial(seed: int, index: int) -> None:
@@ -234,14 +241,12 @@ def interpreted_trial(seed: int, index: int) -> None:
         if a != b:
             words = next((f"compiled {x}, interpreted {y}" for x, y in zip(a, b, strict=True) if x != y), "")
             made = interpreted_episode(seed, index, mine.index(a))
-            found = Failure("interpreted", words[:600])
-            found.add_note(f"{made.described()}, seed {made.seed}, options {made.starts}")
-            raise found
+            raise Failure("interpreted", f"{words[:600]}\n      {made.described()}, seed {made.seed}, {made.starts}")
 
 
 def interpreted_episode(seed: int, index: int, which: int) -> Episode:
     """Return one of the tasks that an interpreted process tries: short, and without orbits to find, for it is slow."""
-    made = episode(draws.generator(seed, INTERPRETED * index + which), 3, longest=0.02, steps=4)
+    made = episode(draws.generator(seed, TASKS * index + which), 3, longest=0.02, steps=4)
     found = {"x_offset": 0.1, "x_scale": 0.7, "v_scale": 0.3, "start": "random"}
     return made._replace(arguments={**made.arguments, **found})
 
@@ -249,7 +254,7 @@ def interpreted_episode(seed: int, index: int, which: int) -> Episode:
 def fingerprints(seed: int, index: int) -> list[Any]:
     """Return the bits of what short rollouts give."""
     prints = []
-    for which in range(INTERPRETED):
+    for which in range(TASKS):
         made = interpreted_episode(seed, index, which)
         rows = [single_rollout(made, 0, "NextStep"), *batch_rollout(made, [0, 1, 2], "NextStep", 1)]
         for lane in rows:
@@ -259,32 +264,35 @@ def fingerprints(seed: int, index: int) -> list[Any]:
     return prints
 
 
-def info_trial(seed: int, index: int) -> Mapping[str, float]:
+def drawn_info(seed: int, index: int) -> Episode:
+    """Return the task of a trial of infos: of one plant, and no episode ends by itself."""
+    made = episode(draws.generator(seed, index), 1)
+    return made._replace(arguments={**made.arguments, "randomise": {}, "show_parameters": False, "episode_steps": 1000})
+
+
+def described_info(seed: int, index: int) -> str:
+    """Return the call that makes the environment of a trial."""
+    return drawn_info(seed, index).described()
+
+
+def info_trial(seed: int, index: int) -> None:
     """Check that a step's info tells one moment: the interval's end, or that at which contact was lost."""
-    rng = draws.generator(seed, index)
-    made = episode(rng, 1)
-    p = made.arguments["parameters"]
-    made.arguments.pop("randomise", None)
-    made.arguments["episode_steps"] = 1000
-    interval = made.arguments["control_interval"]
+    made = drawn_info(seed, index)
+    p, interval = made.arguments["parameters"], made.arguments["control_interval"]
     env = SDFrictionEnv(**made.arguments)
     info = env.reset(seed=made.seed, options=made.starts[0] if made.starts else None)[1]
     for step, action in enumerate(made.actions[:, 0]):
         before, state = info, env.get_state()
         _, _, terminated, truncated, info = env.step(np.array([action]))
+        drive = kernel.Drive(state.v_belt, info["belt_acceleration"], info["force"])
         plant = kernel.at_time(p.plant, step * interval)
-        acting = (info["belt_acceleration"], info["force"])
-        wanted = kernel.advance(
-            plant, kernel.State(state.x, state.v), kernel.Drive(state.v_belt, *acting), interval, None
-        )
+        end = kernel.advance(plant, kernel.State(state.x, state.v), drive, interval, None)
         try:
-            check_info(p, before, info, terminated, truncated, step * interval + wanted[5], wanted[2])
+            check_info(p, before, info, terminated, truncated, step * interval + end.time, end.v_belt)
         except Failure as found:
-            found.add_note(f"{made.described()}, step {step} from {state}, action {float(action)!r}, seed {made.seed}")
-            raise
+            raise Failure(found.kind, f"{found.words}; step {step} from {state}, action {float(action)!r}") from None
         if terminated or truncated:
             break
-    return {}
 
 
 def check_info(
@@ -339,34 +347,26 @@ def check_info(
         raise Failure("info", f"{info['stick_fraction']!r} stuck, mean v^2 {info['mean_square_velocity']!r}")
 
 
-def prepare() -> None:
-    """Compile what the trials call."""
-    rng = np.random.default_rng(0)
-    for friction in ("stribeck", "coulomb"):
-        for geometry in ("exact", "cubic", "linear"):
-            made = episode(rng, 3)
-            made.arguments["parameters"] = OscillatorParameters(friction=friction, geometry=geometry)
-            batch_rollout(made, [0], "NextStep", 1)
-            single_rollout(made, 0, "NextStep")
-
-
 BATCHES = Check(
     "batches",
     "single environments against batches of 1, 3, 300 and 1,100, bit for bit",
     batch_trial,
-    prepare,
-    patience=60.0,
+    drawn=described_batch,
+    patience=120.0,
 )
-INTERPRETED_CHECK = Check(
+INTERPRETED = Check(
     "interpreted",
     "compiled against interpreted code, bit for bit",
     interpreted_trial,
-    prepare,
     patience=120.0,
     slow_fails=False,
 )
 INFOS = Check(
-    "infos", "a step's info: of one moment, and of the plant's forces there", info_trial, prepare, patience=60.0
+    "infos",
+    "a step's info: of one moment, and of the plant's forces there",
+    info_trial,
+    drawn=described_info,
+    patience=60.0,
 )
 
 if __name__ == "__main__":

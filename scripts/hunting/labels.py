@@ -5,18 +5,18 @@ growing length are compared with those of the attractor that the label names. It
 integration steps ends before the extremes are constant; such starts decide nothing.
 """
 
-import functools
 import math
-import time
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from scripts.hunting import draws
+from scripts.hunting.trials import Check, Failure, SetAside
 from sd_friction_env import OscillatorParameters, kernel
 from sd_friction_env.physics.basins import LOST_CONTACT, UNDECIDED, Basins, basins
 from sd_friction_env.physics.orbits import equilibria, stick_intervals
 
-STARTS_OF_A_PLANT = 12
+STARTS = 12  # of one plant
 SAME = 1e-5  # extremes of x, relative to the motion's size
 STILL = 1e-9
 BUDGET = 3e5  # integration steps of a direct run
@@ -131,32 +131,36 @@ def follow(p: OscillatorParameters, x: float, v: float, found: Basins, label: in
         duration *= 2.0
 
 
-@functools.cache
-def compile_for(geometry: str, friction: str, alpha: float) -> None:
-    """Compile what basins of plants with these laws need: it is not what is timed."""
-    basins(OscillatorParameters(geometry=geometry, friction=friction, alpha=alpha), np.zeros(1), np.zeros(1))
+def drawn(seed: int, index: int) -> tuple[OscillatorParameters, np.ndarray]:
+    """Return a plant and starts (STARTS, 2)."""
+    rng = draws.generator(seed, index)
+    p = draw_plant(rng)
+    return p, np.clip(draw_starts(rng, p, STARTS), -10.0, 10.0)
 
 
-def check_basins(seed: int, starts: int) -> tuple[int, int, list[dict[str, Any]]]:
-    """Return how many starts were tried, how many labels a direct run confirmed, and the others, each with its seed."""
-    held, rest = 0, []
-    for plant_number in range(-(-starts // STARTS_OF_A_PLANT)):
-        rng = np.random.default_rng([seed, plant_number])
-        p = draw_plant(rng)
-        count = min(STARTS_OF_A_PLANT, starts - plant_number * STARTS_OF_A_PLANT)
-        places = draw_starts(rng, p, STARTS_OF_A_PLANT)[:count]
-        compile_for(p.geometry, p.friction, 0.0 if p.discontinuous else 0.8)
-        begin = time.perf_counter()
-        found = basins(p, np.clip(places[:, 0], -10, 10), np.clip(places[:, 1], -10, 10))
-        lasted = time.perf_counter() - begin
-        if lasted > 5.0:
-            rest.append({"seed": (seed, plant_number), "verdict": "slow", "why": f"{lasted:.3g} s", "p": p})
-        for (x, v), label in zip(np.clip(places, -10, 10).tolist(), found.labels.tolist(), strict=True):
-            verdict = follow(p, x, v, found, label)
-            what = "undecided" if label == UNDECIDED else verdict.what
-            held += what == "held"
-            if what != "held":
-                known = [(a.kind, a.x_min, a.x_max) for a in found.attractors]
-                case = {"p": p, "x": x, "v": v, "label": label, "attractors": known}
-                rest.append({"seed": (seed, plant_number), "verdict": what, "why": verdict.why, **case})
-    return starts, held, rest
+def verdicts(seed: int, index: int) -> list[Verdict]:
+    """Return what direct runs say of the labels of each start of one random plant."""
+    p, starts = drawn(seed, index)
+    found = basins(p, *starts.T)
+    return [
+        Verdict("undecided") if label == UNDECIDED else follow(p, x, v, found, label)
+        for (x, v), label in zip(starts.tolist(), found.labels.tolist(), strict=True)
+    ]
+
+
+def trial(seed: int, index: int) -> None:
+    """Check labels of basins against direct runs."""
+    found = verdicts(seed, index)
+    if "wrong" in {verdict.what for verdict in found}:
+        raise Failure("labels", f"{found}")
+    if "undecided" in {verdict.what for verdict in found}:
+        raise SetAside("a start of the plant is labelled as not decided")
+
+
+def described(seed: int, index: int) -> str:
+    """Return the call that labels the starts."""
+    p, starts = drawn(seed, index)
+    return f"basins({draws.described(p)}, *np.transpose({starts.tolist()}))"
+
+
+CHECK = Check("labels", "labels of basins against direct runs", trial, drawn=described, patience=120.0)

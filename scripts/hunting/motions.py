@@ -1,12 +1,11 @@
-"""Long motions of random legal plants: attractors that attract, multipliers that do not depend on the section, labels
-of basins; and damaged files."""
+"""Long motions of random legal plants: attractors that attract, multipliers that do not depend on the section."""
 
 import math
 from collections.abc import Mapping
 
 import numpy as np
 
-from scripts.hunting import draws, files, labels
+from scripts.hunting import draws
 from scripts.hunting.trials import Check, Failure, SetAside
 from sd_friction_env import OscillatorParameters, attractors, kernel, simulate
 from sd_friction_env.physics.forced import forced_orbit
@@ -17,7 +16,6 @@ LAPS = 20
 MOVED = 1e-3  # of a cycle's size
 ATTRACTS = 1e-7  # by how much of itself a distance must shrink in that many laps
 SAME_MULTIPLIER = 1e-5
-STARTS = 12  # of one plant, in basins
 
 
 def distance_left(cycle: LimitCycle, moved: float) -> float:
@@ -30,15 +28,13 @@ def distance_left(cycle: LimitCycle, moved: float) -> float:
         period = 2.0 * math.pi / max(abs(slowest.imag), 0.1)
         time = max(LAPS * period, -3.0 / slowest.real if slowest.real else 0.0)
     x, v = cycle.x_max + moved, 0.0
-    out = kernel.advance(p.plant, kernel.State(x, v), kernel.Drive(p.belt_speed, 0.0, 0.0), time, None)
-    if out[4] in (kernel.STEP_LIMIT, kernel.EVENT_LIMIT):
-        raise SetAside(kernel.STATUS_NAMES[out[4]])
-    if out[4] != kernel.OK:
+    end = kernel.advance(p.plant, kernel.State(x, v), kernel.steady(p.belt_speed), time, None)
+    if end.status in (kernel.STEP_LIMIT, kernel.EVENT_LIMIT):
+        raise SetAside(kernel.STATUS_NAMES[end.status])
+    if end.status != kernel.OK:
         return math.inf
-    out = kernel.advance(
-        p.plant, kernel.State(out[0], out[1]), kernel.Drive(p.belt_speed, 0.0, 0.0), 1.25 * period, None
-    )
-    return float(max(abs(out[11] - cycle.x_max), abs(out[10] - cycle.x_min)) / abs(moved))
+    end = kernel.advance(p.plant, kernel.State(end.x, end.v), kernel.steady(p.belt_speed), 1.25 * period, None)
+    return float(max(abs(end.x_max - cycle.x_max), abs(end.x_min - cycle.x_min)) / abs(moved))
 
 
 def place_scale(p: OscillatorParameters, x: float) -> float:
@@ -46,39 +42,35 @@ def place_scale(p: OscillatorParameters, x: float) -> float:
     return max(min(1.0, p.alpha) if "alpha" in draws.SPRING_FIELDS[p.geometry] and p.alpha else 1.0, 1e-3 * abs(x))
 
 
-def attractor_trial(seed: int, index: int) -> Mapping[str, float] | None:
-    """Check that whatever is called an attractor draws in what starts beside it."""
+def drawn_free(seed: int, index: int) -> OscillatorParameters:
+    """Return an unexcited plant on a moving belt."""
     rng = draws.generator(seed, index)
     p = draws.plant(rng, excited=0.0)
-    if p.belt_speed == 0.0:
-        p = p.replace(belt_speed=0.1)
-    if rng.random() < 0.2:
-        p = p.replace(beta=0.0)
-    try:
-        found = attractors(p)
-        for cycle in found:
-            if cycle.kind in ("pure-slip", "steady-slip"):
-                size = cycle.amplitude if cycle.amplitude > 0.0 else 1e-3 * place_scale(p, cycle.x_max)
-                left = min(distance_left(cycle, sign * MOVED * size) for sign in (1.0, -1.0))
-                if not left < 1.0 - ATTRACTS:
-                    words = f"a {cycle.kind} attractor of amplitude {cycle.amplitude:.3g}, multiplier "
-                    words += f"{cycle.floquet_multiplier!r}, keeps {left!r} of a distance from it after {LAPS} laps"
-                    raise Failure("attracts nothing", words)
-            elif cycle.kind == "stick-slip":
-                end = kernel.advance(
-                    p.plant,
-                    kernel.State(cycle.x_phase0, cycle.v_phase0),
-                    kernel.Drive(p.belt_speed, 0.0, 0.0),
-                    cycle.period,
-                    None,
-                )
-                if end[4] == kernel.OK and abs(end[0] - cycle.x_phase0) > 1e-7 * max(1.0, abs(cycle.x_phase0)):
-                    words = f"a stick-slip cycle from x = {cycle.x_phase0!r} is at {end[0]!r} after its period"
-                    raise Failure("no cycle", words)
-    except Exception as error:
-        error.add_note(f"attractors({draws.described(p)})")
-        raise
-    return None
+    p = p.replace(belt_speed=p.belt_speed or 0.1)
+    return p.replace(beta=0.0) if rng.random() < 0.2 else p
+
+
+def described_free(seed: int, index: int) -> str:
+    """Return the call that finds the attractors."""
+    return f"attractors({draws.described(drawn_free(seed, index))})"
+
+
+def attractor_trial(seed: int, index: int) -> None:
+    """Check that whatever is called an attractor draws in what starts beside it."""
+    p = drawn_free(seed, index)
+    for cycle in attractors(p):
+        if cycle.kind in ("pure-slip", "steady-slip"):
+            size = cycle.amplitude if cycle.amplitude > 0.0 else 1e-3 * place_scale(p, cycle.x_max)
+            left = min(distance_left(cycle, sign * MOVED * size) for sign in (1.0, -1.0))
+            if not left < 1.0 - ATTRACTS:
+                words = f"a {cycle.kind} attractor of amplitude {cycle.amplitude:.3g}, multiplier "
+                words += f"{cycle.floquet_multiplier!r}, keeps {left!r} of a distance from it after {LAPS} laps"
+                raise Failure("attracts nothing", words)
+        elif cycle.kind == "stick-slip":
+            start = kernel.State(cycle.x_phase0, cycle.v_phase0)
+            end = kernel.advance(p.plant, start, kernel.steady(p.belt_speed), cycle.period, None)
+            if end.status == kernel.OK and abs(end.x - start.x) > 1e-7 * max(1.0, abs(start.x)):
+                raise Failure("no cycle", f"a stick-slip cycle from {start!r} is at {end.x!r} after its period")
 
 
 def forced_plant(rng: np.random.Generator) -> OscillatorParameters:
@@ -127,51 +119,19 @@ def multiplier_trial(seed: int, index: int) -> Mapping[str, float]:
         gap = max(abs(a - b) for a, b in zip(mine, its, strict=True)) / max(1.0, *mine)
         if gap > SAME_MULTIPLIER:
             words = f"multipliers {orbit.multipliers} from phase {orbit.phase}, {other.multipliers} from a {event.kind}"
-            found = Failure("multipliers", words)
-            found.add_note(
-                f"forced_orbit({draws.described(shifted)}, {event.x!r}, {event.v!r}, multiple={orbit.multiple}"
-                ", transient=0)"
-            )
-            raise found
+            call = f"forced_orbit({draws.described(shifted)}, {event.x!r}, {event.v!r}, multiple={orbit.multiple}"
+            raise Failure("multipliers", f"{words}\n      {call}, transient=0)")
         worst = max(worst, gap)
     return {"largest gap of multipliers": worst}
 
 
-def label_trial(seed: int, index: int) -> None:
-    """Check labels of basins against direct runs."""
-    starts, _, others = labels.check_basins(own_seed(seed, index), STARTS)
-    wrong = [other for other in others if other["verdict"] not in ("not settled", "slow", "undecided")]
-    if not wrong and any(other["verdict"] == "undecided" for other in others):
-        raise SetAside("a start of the plant is labelled as not decided")
-    if wrong:
-        raise Failure(f"labels: {wrong[0]['verdict']}", f"{len(wrong)} of {starts} starts, such as {wrong[0]}")
-
-
-def file_trial(seed: int, index: int) -> None:
-    """Check what damaged files do."""
-    _, _, wrong = files.check_files(own_seed(seed, index))
-    if wrong:
-        raise Failure("files", f"{wrong}")
-
-
-def own_seed(seed: int, index: int) -> int:
-    """Return a seed for another script's check."""
-    return int(draws.generator(seed, index).integers(2**31))
-
-
-def prepare() -> None:
-    """Compile what the trials call."""
-    attractors(OscillatorParameters())
-    attractors(OscillatorParameters(friction="coulomb"))
-
-
-ATTRACTORS = Check("attractors", "attractors draw in what starts beside them", attractor_trial, prepare, patience=60.0)
-MULTIPLIERS = Check(
-    "multipliers",
-    "multipliers of forced orbits: the same from a section on an event",
-    multiplier_trial,
-    prepare,
-    patience=60.0,
+ATTRACTORS = Check(
+    "attractors",
+    "attractors draw in what starts beside them",
+    attractor_trial,
+    drawn=described_free,
+    patience=120.0,
 )
-LABELS = Check("labels", "labels of basins against direct runs", label_trial, prepare, patience=120.0)
-FILES = Check("files", "damaged and hostile files", file_trial, patience=120.0)
+MULTIPLIERS = Check(
+    "multipliers", "multipliers of forced orbits: the same from a section on an event", multiplier_trial, patience=120.0
+)

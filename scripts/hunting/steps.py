@@ -1,10 +1,11 @@
 """One step of a random legal plant: energy, cone, honest modes, and the same interval in pieces."""
 
+import itertools
 import math
+import time
 from collections.abc import Mapping
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,113 +26,69 @@ ENERGY = 1e-7  # residual over the sum of the absolute works and energies
 GARBAGE = 1e-4
 # How much further apart pieces may end than runs whose state was moved by the promised error.
 MARGIN = 10.0
+PIECES = (1, 2, 4)
 FINE = 16
+LONGEST = 1.0  # s of processor time that one control interval may take
 EXAMINED = 20  # one trial in so many is examined in all respects, others only where runs in pieces do not agree
-
-
-@numba.njit(error_model="numpy")
-def in_pieces(plant, x, v, v_belt, a_belt, u, duration, moved, dx, dv, rows):  # type: ignore[no-untyped-def]
-    """Advance over ``duration`` in as many equal pieces as there are ``rows``, which take what ``advance`` returns.
-
-    At the beginning of the piece ``moved`` the state is moved by dx and dv. Return the number of pieces done.
-    """
-    pieces = len(rows)
-    length = duration / pieces  # a power of two of them: exact
-    belt = v_belt
-    for i in range(pieces):
-        if i == moved:
-            x = x + dx
-            v = v + dv
-        begin = i * length
-        out = kernel.advance(
-            kernel.at_time(plant, begin), kernel.State(x, v), kernel.Drive(belt, a_belt, u), length, None
-        )
-        x_end, v_end, b, mode, status, t, n, v2, stuck, fv, low, high = out
-        rows[i] = np.array([x_end, v_end, b, mode, status, t, n, v2, stuck, fv, low, high])
-        if status != kernel.OK:
-            return i + 1
-        x = x_end
-        v = v_end
-        belt = b
-    return pieces
-
-
-@numba.njit(error_model="numpy")
-def at_nodes(plant, x, v, v_belt, a_belt, u, duration, piece, finer, nodes, weights, rows):  # type: ignore[no-untyped-def]
-    """Put times, x, v and weights of a quadrature over ``duration`` into ``rows``; between events it is smooth.
-
-    The pieces are no longer than ``piece``, and then so many times finer.
-    Return how many; the rest has no room.
-    """
-    events = np.empty((kernel.MAX_EVENTS, 4))
-    out = kernel.advance(plant, kernel.State(x, v), kernel.Drive(v_belt, a_belt, u), duration, events)
-    n_events = out[6]
-    t = 0.0
-    n = 0
-    belt = v_belt
-    for event in range(n_events + 1):
-        end = events[event, 0] if event < n_events else duration
-        pieces = finer * (int((end - t) / piece) + 1)
-        length = (end - t) / pieces
-        for _ in range(pieces if length > 0.0 else 0):
-            for j in range(len(nodes)):
-                if n == len(rows):
-                    return n
-                dt = nodes[j] * length
-                out = kernel.advance(
-                    kernel.at_time(plant, t), kernel.State(x, v), kernel.Drive(belt, a_belt, u), dt, None
-                )
-                rows[n, 0] = t + dt
-                rows[n, 1] = out[0]
-                rows[n, 2] = out[1]
-                rows[n, 3] = weights[j] * length
-                n += 1
-            out = kernel.advance(
-                kernel.at_time(plant, t), kernel.State(x, v), kernel.Drive(belt, a_belt, u), length, None
-            )
-            x = out[0]
-            v = out[1]
-            belt = out[2]  # as it is returned: a stuck mass has this speed to the bit
-            t = t + length
-        t = end
-    return n
-
-
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 _NODES, _WEIGHTS = 0.5 * (1.0 + _NODES), 0.5 * _WEIGHTS
+
+
+def advance(p: OscillatorParameters, at: Start, duration: float, since: float = 0.0, events: Any = None) -> FloatArray:
+    """Return what the kernel gives for one piece that begins a time ``since`` after the start, (12,)."""
+    plant = kernel.at_time(kernel.at_time(p.plant, at.time), since)
+    drive = kernel.Drive(at.v_belt, at.a_belt, at.u)
+    return np.array(kernel.advance(plant, kernel.State(at.x, at.v), drive, duration, events)[:12], float)
 
 
 def run(
     p: OscillatorParameters, at: Start, duration: float, pieces: int, moved: tuple[int, float, float] = (-1, 0, 0)
 ) -> FloatArray:
-    """Return what each piece gave, (n, 12)."""
-    rows = np.empty((pieces, 12))
-    plant = kernel.at_time(p.plant, at.time)
-    i, dx, dv = moved
-    done = in_pieces(plant, at.x, at.v, at.v_belt, at.a_belt, at.u, duration, i, float(dx), float(dv), rows)
-    return rows[:done]
+    """Return what each of equal pieces gives, (n, 12), until contact is lost; piece ``moved[0]`` begins with x and v
+    moved by the others."""
+    rows: list[FloatArray] = []
+    state = at
+    length = duration / pieces  # a power of two of them: exact
+    for i in range(pieces):
+        if i == moved[0]:
+            state = state._replace(x=state.x + moved[1], v=state.v + moved[2])
+        rows.append(advance(p, state, length, i * length))
+        if rows[-1][STATUS] != kernel.OK:
+            break
+        x, v, belt = rows[-1][:3].tolist()
+        state = state._replace(x=x, v=v, v_belt=belt)
+    return np.array(rows)
 
 
 def excitation_work(p: OscillatorParameters, at: Start, duration: float, size: float) -> float:
-    """Return the work of the excitation, by quadrature of this file's own, in finer and finer pieces until it is known
-    to a tenth of what the energy balance may miss.
+    """Return the work of the excitation, by Gauss-Legendre quadrature between events, in finer and finer pieces until
+    it is known to a tenth of what the energy balance may miss.
 
     Raises:
         SetAside: if it does not become known.
     """
     acting = [kind for kind in ("force", "ripple", "stiffness") if getattr(p, f"{kind}_amplitude")]
     piece = min(0.05, *(0.5 / getattr(p, f"{kind}_frequency") for kind in acting))
-    plant = kernel.at_time(p.plant, at.time)
-    rows = np.empty((10_000, 4))
+    events = np.empty((kernel.MAX_EVENTS, 4))
+    n_events = int(advance(p, at, duration, events=events)[EVENTS])
+    stretches = list(itertools.pairwise([0.0, *events[:n_events, 0].tolist(), duration]))
     before = math.nan
     for halvings in range(11):
-        nodes = at_nodes(plant, *at[:5], duration, piece, 2**halvings, _NODES, _WEIGHTS, rows)
-        if nodes == len(rows):
+        counts = [2**halvings * (int((end - begin) / piece) + 1) for begin, end in stretches]
+        if len(_NODES) * sum(counts) >= 10_000:
             break
-        t, x, v, weights = rows[:nodes].T
-        power = oracle.exciting_force(p, at.time + t) * v
-        power += oracle.stiffness_rate(p, at.time + t) * oracle.potential(p, x)
-        work = float(np.sum(weights * power))
+        work, state = 0.0, at
+        for (begin, end), count in zip(stretches, counts, strict=True):
+            length = (end - begin) / count
+            for i in range(count if length > 0.0 else 0):
+                since = begin + i * length
+                rows = np.array([advance(p, state, node * length, since) for node in _NODES])
+                t = at.time + since + _NODES * length
+                power = oracle.exciting_force(p, t) * rows[:, V]
+                power += oracle.stiffness_rate(p, t) * oracle.potential(p, rows[:, X])
+                work += float(np.sum(_WEIGHTS * length * power))
+                x, v, belt = advance(p, state, length, since)[:3].tolist()
+                state = state._replace(x=x, v=v, v_belt=belt)  # as returned: a stuck mass has this speed to the bit
         if abs(work - before) < 0.1 * ENERGY * (size + abs(work)):
             return work
         before = work
@@ -139,14 +96,14 @@ def excitation_work(p: OscillatorParameters, at: Start, duration: float, size: f
 
 
 def forces(
-    p: OscillatorParameters, x: float, v: float, belt: float, a_belt: float, u: float, time: float
+    p: OscillatorParameters, x: float, v: float, belt: float, a_belt: float, u: float, now: float
 ) -> list[float]:
     """Return the absolute values of all forces."""
-    speed, acceleration = (float(part) for part in oracle.ripple(p, time)[1:])
-    normal = float(oracle.normal_force(p, x, time))
+    speed, acceleration = (float(part) for part in oracle.ripple(p, now)[1:])
+    normal = float(oracle.normal_force(p, x, now))
     w = v - belt - speed
     mu = max(p.mu_s, abs(float(oracle.friction_coefficient(p, w))))
-    restoring = float(oracle.restoring(p, x, time))
+    restoring = float(oracle.restoring(p, x, now))
     return [
         abs(force) for force in (restoring, mu * normal, 2.0 * p.beta * v, u, p.force_amplitude, a_belt, acceleration)
     ]
@@ -203,8 +160,7 @@ def check_state(p: OscillatorParameters, at: Start, row: FloatArray, begin: floa
 def energy_residual(p: OscillatorParameters, at: Start, rows: FloatArray) -> float:
     """Return the residual of the energy balance over the sum of the absolute works and energies."""
     x, v = float(rows[-1, X]), float(rows[-1, V])
-    reached = INTERVAL * (len(rows) - 1) / max(1, len(rows)) if len(rows) > 1 else 0.0
-    reached += float(rows[-1, TIME])
+    reached = INTERVAL * (len(rows) - 1) / len(rows) + float(rows[-1, TIME])
     begin, end = oracle.stiffness(p, at.time), oracle.stiffness(p, at.time + reached)
     energies = (
         0.5 * at.v**2,
@@ -225,8 +181,8 @@ def allowed(p: OscillatorParameters, at: Start, rows: FloatArray, duration: floa
     greatest = scale = 1.0
     states = [(at.x, at.v, at.v_belt, at.time)]
     states += [(r[X], r[V], r[BELT], at.time + (i + 1) * duration / len(rows)) for i, r in enumerate(rows)]
-    for x, v, belt, time in states:
-        sizes = forces(p, x, v, belt, at.a_belt, at.u, time)
+    for x, v, belt, now in states:
+        sizes = forces(p, x, v, belt, at.a_belt, at.u, now)
         greatest = max(greatest, *sizes)
         scale = max(scale, abs(x), abs(v), kernel.STIFF * sum(sizes))
     scale = max(scale, *np.abs(rows[:, [X_MIN, X_MAX]]).ravel().tolist())
@@ -294,12 +250,11 @@ def examine(p: OscillatorParameters, at: Start, briefly: bool = False) -> Mappin
     Raises:
         Failure, SetAside: as of any trial.
     """
-    runs = [run(p, at, INTERVAL, pieces) for pieces in (1, 2, 4)]
+    runs = [run(p, at, INTERVAL, pieces) for pieces in PIECES]
     if briefly and agree(runs):
         return {}
-    for rows in runs:
+    for pieces, rows in zip(PIECES, runs, strict=True):
         for i, row in enumerate(rows):
-            pieces = (1, 2, 4)[[r is rows for r in runs].index(True)]
             check_state(p, at, row, i * INTERVAL / pieces, INTERVAL / pieces)
     limited = {kernel.STATUS_NAMES[int(r[-1, STATUS])] for r in runs} & {"step limit", "event limit"}
     if limited:
@@ -329,28 +284,41 @@ def described(seed: int, index: int) -> str:
 
 def trial(seed: int, index: int) -> Mapping[str, float]:
     """Check one step of one random plant."""
-    p, at = drawn(seed, index)
-    try:
-        return examine(p, at, briefly=index % EXAMINED != 0)
-    except OverflowError as error:  # the oracle's forces, at what no plant reaches
-        raise Failure("not finite", f"{error}\n      {described(seed, index)}") from None
-    except Failure as found:
-        found.add_note(described(seed, index))
-        raise
+    return examine(*drawn(seed, index), briefly=index % EXAMINED != 0)
 
 
-def prepare() -> None:
-    """Compile what the trials call."""
-    for friction in ("stribeck", "coulomb"):
-        p = OscillatorParameters(friction=friction, force_amplitude=0.1 if friction == "coulomb" else 0.0)
-        examine(p, Start(0.5, 0.0, 0.2, 0.0, 0.0, 0.0))
+def drawn_slow(seed: int, index: int) -> tuple[OscillatorParameters, Start, float]:
+    """Return a plant that is hard to follow, a start and a control interval."""
+    rng = draws.generator(seed, index)
+    p = draws.plant(rng, excited=0.5, hard=1.0)
+    interval = (10.0, 1.0, draws.number(rng, 1e-4, 10.0))[int(rng.integers(3))]
+    return p, draws.start(rng, p, interval), interval
+
+
+def slow_trial(seed: int, index: int) -> Mapping[str, float]:
+    """Measure one control interval."""
+    p, at, interval = drawn_slow(seed, index)
+    least = math.inf
+    for _ in range(3):  # the least time counts
+        begun = time.thread_time()
+        advance(p, at, interval)
+        least = min(least, time.thread_time() - begun)
+        if least <= LONGEST:
+            return {"slowest control interval, s": least}
+    raise Failure("slow", f"a control interval of {interval!r} takes {least:.3g} s")
+
+
+def described_slow(seed: int, index: int) -> str:
+    """Return the plant, the start and the interval of a trial as one types them."""
+    p, at, interval = drawn_slow(seed, index)
+    return f"{draws.described(p)}, {at}, interval {interval!r}"
 
 
 CHECK = Check(
     "steps",
     "single steps: finite, in the cone, honest, energy balanced, the same in 1, 2 and 4 pieces",
     trial,
-    prepare,
-    described,
+    drawn=described,
     share=4.0,
 )
+SLOW = Check("slow", "no control interval takes more than a second", slow_trial, drawn=described_slow)

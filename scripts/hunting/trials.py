@@ -1,19 +1,17 @@
 """The hunt itself: trials run one after another in a process of their own, which may hang or crash without harm."""
 
-import math
+import faulthandler
+import itertools
 import multiprocessing
+import os
 import signal
-import sys
-import time
 import traceback
-from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import NamedTuple
 
-_POLL = 0.1  # s
-_STARTING = 600.0  # s: a worker that starts may have to compile
+_STARTING = 600.0  # s: a process that starts may have to compile
 
 
 class Failure(Exception):  # noqa: N818 (what a trial found, not what went wrong with it)
@@ -21,14 +19,16 @@ class Failure(Exception):  # noqa: N818 (what a trial found, not what went wrong
 
     def __init__(self, kind: str, words: str) -> None:
         super().__init__(f"[{kind}] {words}")
+        self.kind, self.words = kind, words
 
 
 class SetAside(Exception):  # noqa: N818
     """Why a trial says nothing: counted apart and printed."""
 
 
-def nothing() -> None:
-    """Prepare nothing."""
+def nothing(*_: int) -> str:
+    """Prepare nothing, describe nothing."""
+    return ""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Check:
         trial: runs the trial of a seed and an index; returns numbers whose greatest are printed, or None; raises
             :class:`Failure` or :class:`SetAside`. Any other exception is a failure too.
         prepare: is run once in the process of the trials, such as to compile.
-        drawn: returns what a trial is about, for those that had to be ended.
+        drawn: returns what a trial is about, printed with its failure.
         patience: seconds after which a trial is ended. slow_fails: whether it then counts as failed, or is set aside.
         share: of the time of a hunt that is bounded by minutes.
     """
@@ -48,144 +48,80 @@ class Check:
     name: str
     title: str
     trial: Callable[[int, int], Mapping[str, float] | None]
-    prepare: Callable[[], None] = nothing
-    drawn: Callable[[int, int], Any] | None = None
+    prepare: Callable[[], object] = nothing
+    drawn: Callable[[int, int], str] = nothing
     patience: float = 20.0
     slow_fails: bool = True
     share: float = 1.0
 
 
-@dataclass
-class Findings:
-    """What became of a check's trials: ``failures`` by index."""
+class Outcome(NamedTuple):
+    """What became of a trial: "held", "aside" or "failed", why, its numbers, and whether it had to be ended."""
 
-    tried: int = 0
-    held: int = 0
-    aside: Counter[str] = field(default_factory=Counter)
-    failures: dict[int, str] = field(default_factory=dict)
-    greatest: dict[str, tuple[float, int]] = field(default_factory=dict)
-
-    def add(self, index: int, kind: str, words: str, numbers: Mapping[str, float]) -> None:
-        """Count one trial."""
-        self.tried += 1
-        self.held += kind == "held"
-        if kind == "aside":
-            self.aside[words] += 1
-        elif kind == "failed":
-            self.failures[index] = words
-        for name, value in numbers.items():
-            if not value <= self.greatest.get(name, (-1.0, 0))[0]:
-                self.greatest[name] = value, index
+    number: int
+    kind: str
+    words: str = ""
+    numbers: Mapping[str, float] = {}
+    ended: bool = False
 
 
-def outcome(check: Check, seed: int, index: int) -> tuple[int, str, str, dict[str, float]]:
-    """Run one trial; return its index, "held", "aside" or "failed", why, and its numbers."""
+def outcome(check: Check, seed: int, index: int) -> Outcome:
+    """Run one trial."""
     try:
-        return index, "held", "", dict(check.trial(seed, index) or {})
+        return Outcome(index, "held", numbers=dict(check.trial(seed, index) or {}))
     except SetAside as reason:
-        return index, "aside", str(reason), {}
+        return Outcome(index, "aside", str(reason))
     except Failure as found:
-        return index, "failed", "\n      ".join([str(found), *getattr(found, "__notes__", [])]), {}
+        words = str(found)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{place.filename.rsplit('/', 1)[-1]}:{place.lineno}"
-        return index, "failed", f"[{type(error).__name__}] at {where}: {error}", {}
+        words = f"[{type(error).__name__}] at {os.path.basename(place.filename)}:{place.lineno}: {error}"
+    return Outcome(index, "failed", "\n      ".join(filter(None, [words, check.drawn(seed, index)])))
 
 
-def _work(
-    check: Check, seed: int, first: int, last: float, skipped: frozenset[int], now: Any, pipe: Connection
-) -> None:
-    """Run trials from ``first`` on, but none from ``last`` on, and send what became of them."""
+def _work(check: Check, seed: int, first: int, pipe: Connection) -> None:
+    """Run trials from ``first`` on and send what becomes of them; end with exit status 1 when one takes too long."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    check.prepare()
-    done: list[tuple[int, str, str, dict[str, float]]] = []
-    sent = time.monotonic()
-    index = first
-    pipe.send([])
-    while index < last:
-        if index not in skipped:
-            now[0], now[1] = index, time.monotonic()
-            done.append(outcome(check, seed, index))
-        index += 1
-        if time.monotonic() - sent > _POLL:
-            pipe.send(done)
-            done, sent = [], time.monotonic()
-    now[0] = -1.0
-    pipe.send(done)
-    time.sleep(_STARTING)  # until ended
+    with open(os.devnull, "w") as unread:
+        faulthandler.dump_traceback_later(_STARTING, exit=True, file=unread)
+        check.prepare()
+        pipe.send(None)
+        for index in itertools.count(first):
+            faulthandler.dump_traceback_later(check.patience, exit=True, file=unread)
+            pipe.send(outcome(check, seed, index))
 
 
-def hunt(
-    check: Check,
-    seed: int,
-    first: int,
-    count: int | None,
-    seconds: float | None,
-    most_slow: int,
-    report: Callable[[Findings], None] | None = None,
-) -> Findings:
-    """Run trials of a check, from index ``first`` on, until ``count`` are done, ``seconds`` are over, or ``most_slow``
-    had to be ended."""
-    findings = Findings()
+def outcomes(check: Check, seed: int, first: int) -> Generator[Outcome | None, None, None]:
+    """Yield what becomes of trials from index ``first`` on, without end; None when a process is ready to begin.
+
+    Raises:
+        RuntimeError: if the process of the trials cannot begin.
+    """
     context = multiprocessing.get_context("spawn")
-    now = context.RawArray("d", 2)
-    slow: set[int] = set()
-    # Until the first trials are in no time counts: compiling may take minutes.
-    begun: float | None = None
-    upcoming, last = first, math.inf if count is None else first + count
-
-    def enough() -> bool:
-        late = seconds is not None and begun is not None and time.monotonic() - begun > seconds
-        return late or (count is not None and findings.tried >= count) or len(slow) >= most_slow
-
-    while not enough():
-        ours, theirs = context.Pipe()
-        worker = context.Process(
-            target=_work, args=(check, seed, upcoming, last, frozenset(slow), now, theirs), daemon=True
-        )
+    while True:
+        ours, theirs = context.Pipe(duplex=False)
+        worker = context.Process(target=_work, args=(check, seed, first, theirs), daemon=True)
         worker.start()
         theirs.close()
+        is_ready = False
         try:
-            now[0] = -1.0
-            if not ours.poll(_STARTING):
-                raise RuntimeError(f"the check {check.name} was not ready after {_STARTING:g} s")
-            ours.recv()
-            now[1] = time.monotonic()
-            begun = begun or time.monotonic()
-            while not enough():
-                index, since = int(now[0]), now[1]
-                if ours.poll(_POLL):
-                    for result in ours.recv():
-                        upcoming = result[0] + 1
-                        findings.add(*result)
-                    if report is not None:
-                        report(findings)
-                elif time.monotonic() - since > check.patience and int(now[0]) == index and index >= 0:
-                    slow.add(index)
-                    words = f"[slow] not done after {check.patience:g} s"
-                    if check.drawn is not None:
-                        words += f"\n      {check.drawn(seed, index)}"
-                    findings.add(index, "failed" if check.slow_fails else "aside", words, {})
-                    break
-        except EOFError:  # the process of the trials crashed
-            index = int(now[0])
+            while True:
+                found: Outcome | None = ours.recv()
+                first += found is not None
+                is_ready = True
+                yield found
+        except EOFError:  # the process has ended
             worker.join()
-            if index < 0:
+            if not is_ready:
                 raise RuntimeError(f"the check {check.name} cannot begin: exit status {worker.exitcode}") from None
-            slow.add(index)
-            findings.add(index, "failed", f"[crash] the process ended with exit status {worker.exitcode}", {})
-        except KeyboardInterrupt:
-            print("\ninterrupted", file=sys.stderr)
-            raise Interrupted(findings) from None
+            words, kind = f"[crash] the process ended with exit status {worker.exitcode}", "failed"
+            if worker.exitcode == 1:
+                words = f"[slow] not done after {check.patience:g} s"
+                kind = "failed" if check.slow_fails else "aside"
+            if kind == "failed":
+                words += f"\n      {check.drawn(seed, first)}"
+            yield Outcome(first, kind, words, ended=True)
+            first += 1
         finally:
             worker.kill()
             worker.join()
-    return findings
-
-
-class Interrupted(Exception):  # noqa: N818
-    """The user stopped a hunt: with what was found until then."""
-
-    def __init__(self, findings: Findings) -> None:
-        super().__init__("interrupted")
-        self.findings = findings

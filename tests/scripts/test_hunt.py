@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scripts import hunt as script
-from scripts.hunting import against_scipy, draws, environments, events, fuzz, motions, slow, steps, trials
+from scripts.hunting import against_scipy, draws, environments, events, fuzz, motions, steps, trials
 from scripts.hunting.trials import Check, Failure, SetAside
 from sd_friction_env import OscillatorParameters, SDFrictionEnv, SDFrictionVectorEnv, simulate
 
@@ -47,7 +47,7 @@ def test_what_is_right_holds(name):
     check = script.CHECKS[name]
     check.prepare()
     outcomes = [trials.outcome(check, 0, index) for index in HELD[name]]
-    assert [outcome for outcome in outcomes if outcome[1] != "held"] == []
+    assert [outcome for outcome in outcomes if outcome.kind != "held"] == []
 
 
 def test_every_check_is_tried_here_or_lends_another_script():
@@ -83,14 +83,14 @@ START = draws.Start(0.3, 0.1, 0.2, 0.0, 0.01, 0.0)
 
 def step_with(monkeypatch, spoil, start=START):
     """Return the kind of failure that a step gives whose rows are spoiled."""
-    right = steps.in_pieces
+    right = steps.run
 
-    def wrong(*arguments):
-        done = right(*arguments)
-        spoil(arguments[-1])
-        return done
+    def wrong(p, at, duration, pieces, moved=(-1, 0, 0)):
+        rows = right(p, at, duration, pieces, moved)
+        spoil(rows)
+        return rows
 
-    monkeypatch.setattr(steps, "in_pieces", wrong)
+    monkeypatch.setattr(steps, "run", wrong)
     return failure_of(steps.examine, PLAIN, start)
 
 
@@ -140,16 +140,8 @@ def test_creep_and_stick_outside_the_cone_are_found(monkeypatch):
 
 
 def test_a_limit_is_set_aside(monkeypatch):
-    right = steps.in_pieces
-
-    def wrong(*arguments):
-        done = right(*arguments)
-        arguments[-1][:, steps.STATUS] = 3.0
-        return done
-
-    monkeypatch.setattr(steps, "in_pieces", wrong)
     with pytest.raises(SetAside, match="step limit"):
-        steps.examine(PLAIN, START)
+        step_with(monkeypatch, spoil_all(steps.STATUS, 3.0))
 
 
 def test_a_graze_is_judged_by_what_the_promised_error_does_to_it():
@@ -253,13 +245,13 @@ def test_a_multiplier_that_depends_on_the_section_is_found(monkeypatch):
         return orbit
 
     monkeypatch.setattr(motions, "forced_orbit", wrong)
-    kinds = [trials.outcome(motions.MULTIPLIERS, 0, index)[2][:13] for index in HELD["multipliers"]]
+    kinds = [trials.outcome(motions.MULTIPLIERS, 0, index).words[:13] for index in HELD["multipliers"]]
     assert "[multipliers]" in kinds
 
 
 def test_a_slow_interval_is_found(monkeypatch):
-    monkeypatch.setattr(slow, "LONGEST", -1.0)
-    assert failure_of(slow.trial, 0, 0) == "slow"
+    monkeypatch.setattr(steps, "LONGEST", -1.0)
+    assert failure_of(steps.slow_trial, 0, 0) == "slow"
 
 
 def test_errors_of_a_wrong_kind_or_without_a_name_are_found(monkeypatch):
@@ -306,8 +298,8 @@ def mixed_trial(seed, index):
 @pytest.mark.slow
 def test_a_hunt_outlives_trials_that_hang_or_crash():
     check = Check("mixed", "all kinds", mixed_trial, patience=3.0)
-    findings = trials.hunt(check, 0, 0, 9, None, 5)
-    assert (findings.tried, findings.held) == (9, 4)
+    findings, interrupted = script.hunt(check, 0, 0, 9, math.inf)
+    assert (findings.tried, findings.held, findings.ended, interrupted) == (9, 4, 2, False)
     assert findings.aside == {"three says nothing": 1}
     kinds = {index: script.kind_of(words) for index, words in findings.failures.items()}
     assert kinds == {2: "planted", 4: "slow", 5: "crash", 6: "KeyError"}
@@ -317,7 +309,7 @@ def test_a_hunt_outlives_trials_that_hang_or_crash():
 def test_a_check_that_cannot_begin_ends_the_hunt():
     check = Check("broken", "never ready", mixed_trial, prepare=lose_heart)
     with pytest.raises(RuntimeError, match="broken cannot begin"):
-        trials.hunt(check, 0, 0, 9, None, 5)
+        script.hunt(check, 0, 0, 9, math.inf)
 
 
 def lose_heart():

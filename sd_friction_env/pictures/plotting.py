@@ -61,6 +61,18 @@ BORDERS = {
     "v_b1": {"color": VERMILION, "linestyle": (0, (4, 1.2)), "label": "$v_{b1}$: steady slip unstable (Hopf)"},
     "fold": {"color": BLACK, "linestyle": (0, (1, 1)), "label": "fold of pure-slip cycles"},
 }
+CHART_MARKERS = {"turn": "s", "Bautin": "D", "grazing fold": "^", "meeting": "o"}
+BRANCH_MARKERS = {
+    "fold": "s",
+    "branch point": "P",
+    "flip": "D",
+    "Neimark-Sacker": "*",
+    "grazing-sliding": "^",
+    "crossing-sliding": "v",
+    "switching-sliding": "<",
+    "adding-sliding": ">",
+    "grazing": "o",
+}
 LABELS = {
     "alpha": r"anchor height $\alpha$",
     "g1": "weight $g_1$",
@@ -355,6 +367,34 @@ def draw_bifurcation(axis: "Axes", diagram: Table) -> None:
     axis.legend(fontsize=8, frameon=False, loc="best")
 
 
+def _mark_special(axis: "Axes", kinds: Any, x: Any, y: Any, markers: Mapping[str, str]) -> dict[str, Any]:
+    """Mark the points whose kind has a marker; return the handles by kind."""
+    handles: dict[str, Any] = {}
+    for kind, marker in markers.items():
+        part = kinds == kind
+        if part.any():
+            mark: dict[str, Any] = {"linestyle": "none", "color": BLACK, "markersize": 5.5, "label": kind}
+            handles[kind] = axis.plot(x[part], y[part], marker=marker, **mark)[0]
+    return handles
+
+
+@house_style()
+def draw_branches(axis: "Axes", branches: Table) -> None:
+    """Draw the section points of :func:`forced.orbit_branches`, stable orbits solid and unstable dashed, with a marker
+    at each bifurcation; over :func:`draw_bifurcation` they go through its points."""
+    name = branches.metadata["over"]
+    for branch, cycle in sorted(set(zip(branches["branch"].tolist(), branches["cycle"].tolist(), strict=True))):
+        part = (branches["branch"] == branch) & (branches["cycle"] == cycle)
+        x, stable, special = branches["x"][part], branches["stable"][part], branches["kind"][part] != "point"
+        for label, drawn, line in (("stable", stable, "-"), ("unstable", ~stable, (0, (4, 1.2)))):
+            shown, style = np.where(drawn | special, x, np.nan), {"color": PURPLE, "linewidth": 1.6, "linestyle": line}
+            axis.plot(branches[name][part], shown, label="" if branch + cycle > 0 else label, **style)  # type: ignore[arg-type]
+    _mark_special(axis, branches["kind"], branches[name], branches["x"], BRANCH_MARKERS)
+    axis.set_xlabel(label_of(name))
+    axis.set_ylabel("$x$ on the section")
+    axis.legend(fontsize=8, frameon=False, loc="best")
+
+
 @house_style()
 def draw_chart(axis: "Axes", chart: Table) -> None:
     """Draw a chart of :func:`stability_chart`: its regions, its curves, and a marker at each special point."""
@@ -373,11 +413,7 @@ def draw_chart(axis: "Axes", chart: Table) -> None:
         for branch in np.unique(chart["branch"][(chart["curve"] == curve) & (chart["branch"] >= 0)]):
             part = (chart["curve"] == curve) & (chart["branch"] == branch)
             handles[curve] = axis.plot(over[part], speeds[part], linewidth=2.0, **style)[0]  # type: ignore[arg-type]
-    for kind, marker in (("turn", "s"), ("Bautin", "D"), ("grazing fold", "^"), ("meeting", "o")):
-        part = chart["kind"] == kind
-        if part.any():
-            mark: dict[str, Any] = {"linestyle": "none", "color": BLACK, "markersize": 5.5, "label": kind}
-            handles[kind] = axis.plot(over[part], speeds[part], marker=marker, **mark)[0]
+    handles |= _mark_special(axis, chart["kind"], over, speeds, CHART_MARKERS)
     axis.set_ylim(bottom=0.0)
     axis.margins(x=0.0, y=0.0)
     axis.set_xlabel(label_of(name))

@@ -104,9 +104,9 @@ def _critical(options: argparse.Namespace) -> int:
 
 
 def _chart(options: argparse.Namespace) -> int:
-    if options.belt_speed is not None:
+    over, against, engine = _range_of("--over", options.over), _against(options), engine_of(options)
+    if against == "belt_speed" and options.belt_speed is not None:
         raise UsageError("--belt-speed is an axis of the chart: leave it out")
-    over, against, engine = _range_of(options), options.against.replace("-", "_"), engine_of(options)
     chart = stability_chart(one_of(options), over, against, points=options.points, engine=engine)
     chart.metadata = metadata_of(options) | chart.metadata
     emit(options, chart)
@@ -117,14 +117,22 @@ def _chart(options: argparse.Namespace) -> int:
     return 0
 
 
-def _range_of(options: argparse.Namespace) -> tuple[str, float, float]:
-    """Return the parameter of --over and its range."""
-    name, text = options.over
+def _range_of(option: str, given: list[str]) -> tuple[str, float, float]:
+    """Return a parameter and its range."""
+    name, text = given
     try:
         low, high = (float(part) for part in text.split(":"))
     except ValueError:
-        raise UsageError(f"--over {name}: {text!r} must be LOW:HIGH, two numbers") from None
+        raise UsageError(f"{option} {name}: {text!r} must be LOW:HIGH, two numbers") from None
     return name.replace("-", "_"), low, high
+
+
+def _against(options: argparse.Namespace) -> str | tuple[str, float, float]:
+    if options.against in (["belt_speed"], ["belt-speed"]):
+        return "belt_speed"
+    if len(options.against) != 2:
+        raise UsageError(f"--against must be belt_speed, or NAME LOW:HIGH, got {' '.join(options.against)!r}")
+    return _range_of("--against", options.against)
 
 
 def _simulate(options: argparse.Namespace) -> int:
@@ -256,7 +264,7 @@ def _response(options: argparse.Namespace) -> int:
 
 
 def _branches(options: argparse.Namespace) -> int:
-    (name, low, high), grid = _range_of(options), grid_of(options)
+    (name, low, high), grid = _range_of("--over", options.over), grid_of(options)
     if name in grid[0][0]:
         raise UsageError(f"--{options.over[0]} is where the branch starts: give one value")
     x, v = start_of(options)
@@ -303,7 +311,8 @@ def _add_critical(parser: argparse.ArgumentParser) -> None:
 
 def _add_chart(parser: argparse.ArgumentParser) -> None:
     _add_range(parser, "the second parameter and its range, such as alpha 0.1:1.2")
-    parser.add_argument("--against", default="belt_speed", metavar="NAME", help="the other axis (default: belt_speed)")
+    text = "the other axis (default: belt_speed); of another parameter with its range, at the oscillator's belt speed"
+    parser.add_argument("--against", nargs="+", default=["belt_speed"], metavar=("NAME", "LOW:HIGH"), help=text)
     _add_points(parser, 200)
     add_engine(parser)
     add_output(parser, "the chart: where it squeals")
@@ -443,6 +452,7 @@ COMMANDS = {
         _chart,
         "--over alpha 0.1:1.2 --against belt_speed --plot chart.png --out chart.csv",
         "--friction gaussian --geometry linear --over beta 0.02:0.1 --plot chart.png",
+        "--belt-speed 0.3 --over alpha 0.4:1.2 --against mu-m 0.05:0.18 --plot chart.png",
     ),
     "simulate": _command(
         _add_simulate,

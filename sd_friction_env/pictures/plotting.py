@@ -400,8 +400,8 @@ def draw_chart(axis: "Axes", chart: Table) -> None:
     """Draw a chart of :func:`stability_chart`: its regions, its curves, and a marker at each special point."""
     from matplotlib.patches import Patch
 
-    name = chart.metadata["over"]
-    over, speeds = chart[name], chart["belt_speed"]
+    name, against = chart.metadata["over"], chart.metadata.get("against", "belt_speed")
+    over, other = chart[name], chart[against]
     kinds = iter(chart["kind"][(chart["curve"] == "region") & (chart["kind"] != "rest")].tolist())
     handles: dict[str, Any] = {}
     for slab in slabs_of(chart):
@@ -412,12 +412,13 @@ def draw_chart(axis: "Axes", chart: Table) -> None:
     for curve, style in BORDERS.items():
         for branch in np.unique(chart["branch"][(chart["curve"] == curve) & (chart["branch"] >= 0)]):
             part = (chart["curve"] == curve) & (chart["branch"] == branch)
-            handles[curve] = axis.plot(over[part], speeds[part], linewidth=2.0, **style)[0]  # type: ignore[arg-type]
-    handles |= _mark_special(axis, chart["kind"], over, speeds, CHART_MARKERS)
-    axis.set_ylim(bottom=0.0)
+            handles[curve] = axis.plot(over[part], other[part], linewidth=2.0, **style)[0]  # type: ignore[arg-type]
+    handles |= _mark_special(axis, chart["kind"], over, other, CHART_MARKERS)
+    if against == "belt_speed":
+        axis.set_ylim(bottom=0.0)
     axis.margins(x=0.0, y=0.0)
     axis.set_xlabel(label_of(name))
-    axis.set_ylabel(label_of("belt_speed"))
+    axis.set_ylabel(label_of(against))
     axis.legend(handles=list(handles.values()), fontsize=8, loc="best")
 
 

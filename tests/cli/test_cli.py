@@ -155,11 +155,16 @@ def test_a_chart_is_the_functions(tmp_path, capsys):
     assert np.array_equal(table["belt_speed"], wanted["belt_speed"])
     assert table["kind"].tolist() == wanted["kind"].tolist()
     assert plot.read_bytes().startswith(b"\x89PNG")
+    fixed = ["g1", "1.0:1.2", "--against", "beta", "0.05:0.15", "--belt-speed", "0.3"]
+    assert main([*command, *fixed, "--out", str(out), "--plot", str(plot)]) == 0
+    assert Table.from_csv(out).metadata["against"] == "beta"
     for bad, said in (
         (["beta", "0.1"], "'0.1' must be LOW:HIGH"),
         (["beta", "0.1:0.02"], "low < high"),
         (["mass", "0:1"], "over must be one of"),
-        (["beta", "0.02:0.1", "--against", "alpha"], "against must be one of"),
+        (["beta", "0.02:0.1", "--against", "g1"], "--against must be belt_speed, or NAME LOW:HIGH, got 'g1'"),
+        (["beta", "0.02:0.1", "--against", "g1", "1"], "--against g1: '1' must be LOW:HIGH"),
+        (["beta", "0.02:0.1", "--against", "beta", "0:1"], "against must be one of"),
         (["beta", "0.02:0.1", "--belt-speed", "0.2"], "an axis of the chart"),
     ):
         assert main([*command, *bad]) == 2

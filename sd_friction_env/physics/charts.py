@@ -300,6 +300,14 @@ def slabs_of(chart: Table) -> list[Slab]:
     return found
 
 
+def filled_regions(chart: Table) -> Iterator[tuple[str, FloatArray, FloatArray, FloatArray]]:
+    """Yield each region of a chart: its name, values of the second parameter, and its lower and upper bound there."""
+    kinds = iter(chart["kind"][(chart["curve"] == "region") & (chart["kind"] != "rest")].tolist())
+    for slab in slabs_of(chart):
+        for low, high in itertools.pairwise(slab.bounds):
+            yield next(kinds), slab.values, low, high
+
+
 def _regions(chart: Table, request: Request) -> list[dict[str, Any]]:
     """Return a row for each region: a point in it and its name."""
     found, against = [], request.against[0]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env.extras import extra
 from sd_friction_env.physics.basins import Basins
-from sd_friction_env.physics.charts import slabs_of
+from sd_friction_env.physics.charts import filled_regions
 from sd_friction_env.physics.forced import ForcedBasins
 from sd_friction_env.physics.orbits import LimitCycle
 from sd_friction_env.physics.simulation import Trajectory
@@ -402,13 +402,10 @@ def draw_chart(axis: "Axes", chart: Table) -> None:
 
     name, against = chart.metadata["over"], chart.metadata.get("against", "belt_speed")
     over, other = chart[name], chart[against]
-    kinds = iter(chart["kind"][(chart["curve"] == "region") & (chart["kind"] != "rest")].tolist())
     handles: dict[str, Any] = {}
-    for slab in slabs_of(chart):
-        for low, high in zip(slab.bounds, slab.bounds[1:], strict=False):
-            kind = next(kinds)
-            axis.fill_between(slab.values, low, high, color=REGIONS[kind], linewidth=0.0)
-            handles[kind] = Patch(facecolor=REGIONS[kind], edgecolor="0.6", label=kind)
+    for kind, values, low, high in filled_regions(chart):
+        axis.fill_between(values, low, high, color=REGIONS[kind], linewidth=0.0)
+        handles[kind] = Patch(facecolor=REGIONS[kind], edgecolor="0.6", label=kind)
     for curve, style in BORDERS.items():
         for branch in np.unique(chart["branch"][(chart["curve"] == curve) & (chart["branch"] >= 0)]):
             part = (chart["curve"] == curve) & (chart["branch"] == branch)

@@ -1,20 +1,15 @@
 """Print branches of forced orbits against closed forms, and the conditions at their bifurcations.
 
-python scripts/branches.py                everything (some seconds)
-python scripts/branches.py --plot b.png   also a branch over the brute-force bifurcation diagram
+python scripts/branches.py   everything (some seconds)
 """
 
-import argparse
 import math
 import time
 from typing import Any
 
-import numpy as np
-
 from sd_friction_env import OscillatorParameters
 from sd_friction_env.physics.forced import (
     OrbitBranch,
-    bifurcation_diagram,
     doubled_orbit,
     follow_orbit,
     forced_orbit,
@@ -44,9 +39,6 @@ def show(branch: OrbitBranch) -> None:
 
 def main() -> None:
     """Print everything."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--plot", help="picture of a branch over the bifurcation diagram")
-    options = parser.parse_args()
     print("grazing-sliding of a Coulomb oscillator on a belt (v_b = 0.5, beta = 0.05), against the linear response")
     for rate in (0.7, 1.3, 2.0):
         exact = 0.5 * math.hypot(1.0 - rate**2, 0.1 * rate) / rate
@@ -72,28 +64,7 @@ def main() -> None:
     show(branch)
     print("its orbits of twice the period, from the flip on")
     flip = branch.table["kind"].tolist().index("flip")
-    double = follow_orbit(doubled_orbit(branch.orbits[flip], "force_amplitude"), over)
-    show(double)
-    if options.plot:
-        plot(options.plot, [branch, double])
-
-
-def plot(path: str, branches: list[OrbitBranch]) -> None:
-    """Draw branches, stable (line) and unstable (dots), over the settled motions of a sweep both ways."""
-    import matplotlib.pyplot as plt
-
-    name, (low, high) = branches[0].table.metadata["over"], branches[0].table.metadata["range"]
-    diagram = bifurcation_diagram(STRIBECK, name, np.linspace(low, high, 150), direction="both", cycles=60)
-    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
-    axes.plot(diagram["value"], diagram["x"], ",", color="0.6")
-    for branch in branches:
-        for stable, color in ((True, "C0"), (False, "C3")):
-            chosen = [i for i, orbit in enumerate(branch.orbits) if orbit.stable == stable]
-            for n in range(branch.orbits[0].multiple):
-                x = [branch.orbits[i].points[n, 0] for i in chosen]
-                axes.plot(branch.table[name][chosen], x, ".", color=color, markersize=2)
-    axes.set(xlabel=name, ylabel="x at the section", title="stable orbits blue, unstable red, sweeps grey")
-    figure.savefig(path, dpi=80)
+    show(follow_orbit(doubled_orbit(branch.orbits[flip], "force_amplitude"), over))
 
 
 if __name__ == "__main__":

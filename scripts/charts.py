@@ -9,6 +9,7 @@ import time
 from typing import Any
 
 import numpy as np
+from scipy.optimize import newton
 
 from sd_friction_env import OscillatorParameters, Table, stability_chart
 from sd_friction_env.physics.orbits import grazing_belt_speed, grazing_map, hopf_belt_speed
@@ -16,10 +17,17 @@ from sd_friction_env.physics.orbits import grazing_belt_speed, grazing_map, hopf
 DIRECT = {"v_b0": grazing_belt_speed, "v_b1": hopf_belt_speed}
 OVER_ALPHA = ("alpha", 0.2, 1.2)
 # Charts with special points: a plant, and the range of a parameter.
+GAUSSIAN: dict[str, Any] = {"geometry": "linear", "friction": "gaussian", "mu_s": 0.4, "mu_k": 0.2}
 SPECIAL: dict[str, tuple[dict[str, Any], tuple[str, float, float]]] = {
     "cubic": ({"geometry": "cubic"}, ("mu_m", 0.0, 0.19)),
-    "gaussian": ({"geometry": "linear", "friction": "gaussian", "mu_s": 0.4, "mu_k": 0.2}, ("beta", 0.02, 0.2)),
+    "gaussian": (GAUSSIAN, ("beta", 0.02, 0.2)),
     "exact": ({}, ("v_m", 0.1, 2.0)),
+}
+# At a fixed belt speed: a plant, and the ranges of two parameters.
+PAIRS: dict[str, tuple[dict[str, Any], tuple[str, float, float], tuple[str, float, float]]] = {
+    "exact": ({"belt_speed": 0.3}, ("alpha", 0.4, 1.2), ("mu_m", 0.05, 0.18)),
+    "cubic": ({"geometry": "cubic", "belt_speed": 0.35}, ("g1", 0.8, 1.1), ("beta", 0.02, 0.1)),
+    "gaussian": ({**GAUSSIAN, "belt_speed": 0.5}, ("g1", 0.5, 1.5), ("beta", 0.02, 0.2)),
 }
 
 
@@ -32,6 +40,15 @@ def against_direct(parameters: OscillatorParameters, chart: Table, curve: str) -
     roots = np.array([DIRECT[curve](plant) for plant in plants])
     spent = time.perf_counter() - begun
     return len(roots), float(np.abs(roots - chart["belt_speed"][chosen]).max()), spent
+
+
+def root_of(parameters: OscillatorParameters, curve: str, name: str, near: float) -> float:
+    """Return the value of a parameter, close to one, at which a curve passes the belt speed: the secant method."""
+
+    def missed(value: float) -> float:
+        return float(DIRECT[curve](parameters.replace(**{name: value})) - parameters.belt_speed)
+
+    return float(newton(missed, near * (1.0 + 1e-5), tol=1e-11))
 
 
 def main() -> None:
@@ -51,6 +68,17 @@ def main() -> None:
             of_roots += seconds
             print(f"  {geometry:6} {curve}: {count} points, greatest difference {error:.1e} (wanted: 1e-8)")
         print(f"  {geometry:6} chart {spent:.2f} s, direct {of_roots:.2f} s: {of_roots / spent:.1f} times (wanted: 5)")
+    print("curves at a fixed belt speed against direct roots of the second parameter, about 20 points of each")
+    for label, (laws, over, against) in PAIRS.items():
+        plant = OscillatorParameters(**laws)
+        chart = stability_chart(plant, over, against, points=options.points)
+        for curve in DIRECT:
+            rows = [row for row in chart.rows() if row["curve"] == curve and row["branch"] >= 0]
+            rows = rows[:: max(1, len(rows) // 20)]
+            roots = [root_of(plant.replace(**{over[0]: r[over[0]]}), curve, against[0], r[against[0]]) for r in rows]
+            error = max(abs(root - row[against[0]]) for root, row in zip(roots, rows, strict=True))
+            axes = f"{over[0]} and {against[0]} at v_b = {plant.belt_speed}"
+            print(f"  {label:9} {curve} in {axes}: {len(rows)} points, greatest difference {error:.1e} (wanted: 1e-8)")
     print("special points: the largest residual of all their conditions (wanted: 1e-8)")
     for label, (laws, over) in SPECIAL.items():
         chart = stability_chart(OscillatorParameters(**laws), over, points=100)

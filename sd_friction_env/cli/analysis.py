@@ -36,7 +36,7 @@ from sd_friction_env.physics import sweeps
 from sd_friction_env.physics.basins import basin_grid
 from sd_friction_env.physics.charts import stability_chart
 from sd_friction_env.physics.curves import checked_belt_speeds, refined_curve
-from sd_friction_env.physics.forced import lyapunov_exponent, poincare_section
+from sd_friction_env.physics.forced import bifurcation_diagram, lyapunov_exponent, poincare_section
 from sd_friction_env.physics.orbits import critical_belt_speeds, first_lyapunov_coefficient, limit_cycle
 from sd_friction_env.physics.parameters import OscillatorParameters
 from sd_friction_env.physics.simulation import simulate
@@ -120,20 +120,32 @@ def _critical(options: argparse.Namespace) -> int:
 
 
 def _chart(options: argparse.Namespace) -> int:
-    if options.belt_speed is not None:
+    over, against, engine = _range_of("--over", options.over), _against(options), engine_of(options)
+    if against == "belt_speed" and options.belt_speed is not None:
         raise UsageError("--belt-speed is an axis of the chart: leave it out")
-    name, text = options.over
-    try:
-        low, high = (float(part) for part in text.split(":"))
-    except ValueError:
-        raise UsageError(f"--over {name}: {text!r} must be LOW:HIGH, two numbers") from None
-    name, against = name.replace("-", "_"), options.against.replace("-", "_")
-    engine = engine_of(options)
-    chart = stability_chart(one_of(options), (name, low, high), against, points=options.points, engine=engine)
+    chart = stability_chart(one_of(options), over, against, points=options.points, engine=engine)
     chart.metadata = metadata_of(options) | chart.metadata
     emit(options, chart)
     _plot(options, 6.4, 4.4, plotting.draw_chart, chart)
     return 0
+
+
+def _range_of(option: str, given: list[str]) -> tuple[str, float, float]:
+    """Return a parameter and its range."""
+    name, text = given
+    try:
+        low, high = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise UsageError(f"{option} {name}: {text!r} must be LOW:HIGH, two numbers") from None
+    return name.replace("-", "_"), low, high
+
+
+def _against(options: argparse.Namespace) -> str | tuple[str, float, float]:
+    if options.against in (["belt_speed"], ["belt-speed"]):
+        return "belt_speed"
+    if len(options.against) != 2:
+        raise UsageError(f"--against must be belt_speed, or NAME LOW:HIGH, got {' '.join(options.against)!r}")
+    return _range_of("--against", options.against)
 
 
 def _simulate(options: argparse.Namespace) -> int:
@@ -245,6 +257,33 @@ def _over(
     return 0
 
 
+def _branches(options: argparse.Namespace) -> int:
+    (name, low, high), grid = _range_of("--over", options.over), grid_of(options)
+    if name in grid[0][0]:
+        raise UsageError(f"--{options.over[0]} is where the branch starts: give one value")
+    x, v = start_of(options)
+    how: dict[str, Any] = {"points": options.points, "doublings": options.doubled, "transient": options.transient}
+    plants = [parameters for _, parameters in grid]
+    tables = sweeps.branch_sweep(plants, (name, low, high), engine_of(options), x=x, v=v, **how)
+    parts = (with_columns(part, swept) for part, (swept, _) in zip(tables, grid, strict=True))
+    emit(options, stacked(parts, metadata_of(options)))
+    if options.plot is not None:
+        values = [value for value in np.linspace(low, high, 201).tolist() if _is_valid(plants[0], name, value)]
+        brute_force = bifurcation_diagram(plants[0], name, values, direction="both", cycles=60, x=x, v=v)
+        figure, axes = plotting.new_figure(7.0, 4.4, 1, 1)
+        plotting.draw_bifurcation(axes[0, 0], brute_force)
+        plotting.draw_branches(axes[0, 0], tables[0])
+        plotting.save_figure(figure, options.plot)
+    return 0
+
+
+def _is_valid(parameters: OscillatorParameters, name: str, value: float) -> bool:
+    try:
+        return parameters.replace(**{name: value}) is not None
+    except ValueError:
+        return False
+
+
 # Options --------------------------------------------------------------------------------------------------------------
 
 
@@ -261,13 +300,21 @@ def _add_cycle(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_chart(parser: argparse.ArgumentParser) -> None:
-    text = "the second parameter and its range, such as alpha 0.1:1.2"
-    parser.add_argument("--over", nargs=2, required=True, metavar=("NAME", "LOW:HIGH"), help=text)
-    parser.add_argument("--against", default="belt_speed", metavar="NAME", help="the other axis (default: belt_speed)")
-    text = "least number on a curve over the whole range (default: 200)"
-    parser.add_argument("--points", type=int, default=200, metavar="N", help=text)
+    _add_range(parser, "the second parameter and its range, such as alpha 0.1:1.2")
+    text = "the other axis (default: belt_speed); of another parameter with its range, at the oscillator's belt speed"
+    parser.add_argument("--against", nargs="+", default=["belt_speed"], metavar=("NAME", "LOW:HIGH"), help=text)
+    _add_points(parser, 200)
     add_engine(parser)
     add_output(parser, "the chart: where it squeals")
+
+
+def _add_range(parser: argparse.ArgumentParser, text: str) -> None:
+    parser.add_argument("--over", nargs=2, required=True, metavar=("NAME", "LOW:HIGH"), help=text)
+
+
+def _add_points(parser: argparse.ArgumentParser, default: int) -> None:
+    text = f"least number on a curve over the whole range (default: {default})"
+    parser.add_argument("--points", type=int, default=default, metavar="N", help=text)
 
 
 def _add_simulate(parser: argparse.ArgumentParser) -> None:
@@ -310,7 +357,11 @@ def _add_integrity(parser: argparse.ArgumentParser) -> None:
 def _add_cycles(parser: argparse.ArgumentParser, default: int) -> None:
     text = f"drive periods recorded (default: {default})"
     parser.add_argument("--cycles", type=int, default=default, metavar="N", help=text)
-    text = "drive periods before them (default: 200)"
+    _add_transient(parser, "them")
+
+
+def _add_transient(parser: argparse.ArgumentParser, what: str) -> None:
+    text = f"drive periods before {what} (default: 200)"
     parser.add_argument("--transient", type=int, default=200, metavar="N", help=text)
 
 
@@ -338,6 +389,17 @@ def _add_over(parser: argparse.ArgumentParser, cycles: int, plot: str) -> None:
 def _add_bifurcation(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--exponents", action="store_true", help="the largest Lyapunov exponent of each as well")
     _add_over(parser, 60, "the diagram")
+
+
+def _add_branches(parser: argparse.ArgumentParser) -> None:
+    add_start(parser)
+    _add_transient(parser, "the orbit is looked for")
+    _add_range(parser, "the parameter and its range; the branch starts at the oscillator's own value")
+    text = "also the orbits of twice the period from each flip on, N times (default: 1)"
+    parser.add_argument("--doubled", type=int, nargs="?", const=1, default=0, metavar="N", help=text)
+    _add_points(parser, 100)
+    add_engine(parser)
+    add_output(parser, "the branches over the bifurcation diagram")
 
 
 def _command(
@@ -380,6 +442,7 @@ COMMANDS = {
         _chart,
         "--over alpha 0.1:1.2 --against belt_speed --plot chart.png --out chart.csv",
         "--friction gaussian --geometry linear --over beta 0.02:0.1 --plot chart.png",
+        "--belt-speed 0.3 --over alpha 0.4:1.2 --against mu-m 0.05:0.18 --plot chart.png",
     ),
     "simulate": _command(
         _add_simulate,
@@ -413,6 +476,12 @@ COMMANDS = {
         _add_bifurcation,
         lambda given: _over(given, sweeps.bifurcation_sweep, plotting.draw_bifurcation, lyapunov=given.exponents),
         "--force-frequency 1.3 --over force-amplitude 0.01:0.3:0.002 --backend loky --plot diagram.png",
+    ),
+    "branches": _command(
+        _add_branches,
+        _branches,
+        "--alpha 0.7 --force-amplitude 0.12 --over force-amplitude 0.02:0.3 --doubled --out branches.csv --plot b.png",
+        "--alpha 0.5:0.9:0.05 --force-amplitude 0.12 --over belt-speed 0.05:0.4 --folder kept --out branches.csv",
     ),
     "response": _command(
         lambda parser: _add_over(parser, 32, "amplitude and phase"),

@@ -21,6 +21,7 @@ _COMMANDS = {
     "poincare": ("analysis", "plot", "the state once per drive period of a forced motion"),
     "lyapunov": ("analysis", "plot", "Lyapunov exponents: is a motion chaotic?"),
     "bifurcation": ("analysis", "plot", "sections of a forced motion over a parameter, up and down"),
+    "branches": ("analysis", "plot", "periodic orbits of a forced motion, stable or not, followed over a parameter"),
     "response": ("analysis", "plot", "amplitude and phase of a forced motion over a parameter, up and down"),
     "train": ("train", "train", "an agent that suppresses the vibration, in a run folder"),
     "evaluate": ("evaluate", "train", "agents and classical controllers compared on the protocol's episodes"),

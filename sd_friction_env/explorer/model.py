@@ -32,16 +32,19 @@ from sd_friction_env.control.pretrained import load_pretrained
 from sd_friction_env.environments.ids import environment_id
 from sd_friction_env.environments.single import SDFrictionEnv
 from sd_friction_env.physics.basins import basin_grid
+from sd_friction_env.physics.charts import filled_regions, stability_chart
 from sd_friction_env.physics.curves import amplitude_curve
 from sd_friction_env.physics.orbits import LimitCycle, OrbitError, limit_cycle
 from sd_friction_env.physics.parameters import STATE_LIMIT, Kind, OscillatorParameters
-from sd_friction_env.pictures.plotting import BLACK, BLUE, GREEN, GREY, VERMILION
+from sd_friction_env.pictures.plotting import BLACK, BLUE, GREEN, GREY, REGIONS, VERMILION
 
 OFF, FEEDBACK, FOLLOWER, HAND = "off", "velocity feedback", "threshold follower", "by hand"
 AGENT, ROBUST = "trained agent", "trained agent, robust"
 PLUGINS = "sd_friction_env.controllers"  # group of entry points: functions from an environment's id to a policy
 BASIN_VIEW = ((-1.6, 1.6), (-1.2, 1.2))  # starts in x and in v
 COMPILATION = 15  # seconds, roughly, on a quiet core
+CHART_COLUMNS = ("x", "y", "color", "dash")
+_CHART_POINTS = 30  # least number on a curve from one end to the other
 _GAIN = 1.5
 _LONGEST = 1_000_000  # steps of an episode, more than anybody watches
 _HISTORY = 600  # control intervals remembered
@@ -298,6 +301,49 @@ def basin_picture(parameters: OscillatorParameters) -> tuple[NDArray[np.float64]
             f"{found.fraction(i)[0]:.0%} of the starts: {cycle.kind} around x = {place:.2f}, A = {cycle.amplitude:.3f}"
         )
     return np.where(found.labels >= 0, found.labels, np.nan).astype(float), "<br>".join(words)
+
+
+class ChartPicture(NamedTuple):
+    """Where a plant squeals over a second parameter and the belt speed, without excitation.
+
+    ``regions`` (polygons) and ``borders`` (lines) are columns x, y, color, dash, and kind or curve; ``reach``: (low,
+    high) of the parameter and of the belt speed; ``words``: what is missing.
+    """
+
+    parameters: OscillatorParameters
+    name: str
+    regions: dict[str, list[Any]]
+    borders: dict[str, list[Any]]
+    reach: tuple[tuple[float, float], tuple[float, float]]
+    words: str
+
+    def holds_for(self, parameters: OscillatorParameters) -> bool:
+        """Whether another plant lies in the same chart."""
+        axes = {name: getattr(self.parameters, name) for name in (self.name, "belt_speed")}
+        return parameters.replace(**axes).unexcited == self.parameters.unexcited
+
+
+def chart_picture(parameters: OscillatorParameters, over: tuple[str, float, float]) -> ChartPicture:
+    """Compute the chart of a plant over a parameter, (name, low, high)."""
+    chart = stability_chart(parameters.unexcited, over, points=_CHART_POINTS)
+    regions: list[tuple[Any, ...]] = [
+        (np.append(values, values[::-1]), np.append(low, high[::-1]), REGIONS[kind], "solid", kind)
+        for kind, values, low, high in filled_regions(chart)
+    ]
+    borders: list[tuple[Any, ...]] = []
+    for curve, color, dash in (("v_b0", BLUE, "solid"), ("v_b1", VERMILION, "dashed"), ("fold", BLACK, "dotted")):
+        for branch in np.unique(chart["branch"][(chart["curve"] == curve) & (chart["branch"] >= 0)]):
+            part = (chart["curve"] == curve) & (chart["branch"] == branch)
+            borders.append((chart[over[0]][part], chart["belt_speed"][part], color, dash, curve))
+    why = dict.fromkeys(chart["reason"][chart["kind"] == "none"].tolist())
+    words = "" if borders else "; ".join(why)
+    top = max((float(high.max()) for _, _, _, high in filled_regions(chart)), default=1.0)
+    columns = _chart_columns("kind", regions), _chart_columns("curve", borders)
+    return ChartPicture(parameters, over[0], columns[0], columns[1], (over[1:], (0.0, top)), words)
+
+
+def _chart_columns(label: str, rows: list[tuple[Any, ...]]) -> dict[str, list[Any]]:
+    return {name: [row[i] for row in rows] for i, name in enumerate((*CHART_COLUMNS, label))}
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,9 @@ import contextlib
 import dataclasses
 import functools
 import html
+import multiprocessing
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +33,17 @@ from sd_friction_env.environments.ids import TASKS
 from sd_friction_env.explorer.model import (
     AT_REST,
     BASIN_VIEW,
+    CHART_COLUMNS,
     COMPILATION,
     HAND,
     OFF,
+    ChartPicture,
     Latest,
     Live,
     PlantPicture,
     Sign,
     basin_picture,
+    chart_picture,
     controllers,
     is_loaded,
 )
@@ -114,6 +118,7 @@ class Controls:
         self.controller = Select(options=controllers(), value=OFF, title="controller", name="controller", **fill)
         self.hand = Slider(title="action by hand", start=-1, end=1, step=0.05, value=0, name="hand", **fill)
         self.pause = Toggle(label="pause", name="pause", **fill)
+        self.over = Select(title="over", name="over", options=["alpha"], value="alpha", width=180)
         self.message = Div(name="message", stylesheets=[style], **fill)
         self.plant: dict[str, Any] = {
             "geometry": Select(options=list(GEOMETRIES), title="spring", name="geometry", **fill),
@@ -150,6 +155,18 @@ class Controls:
             **fill,
         )
 
+    def chart_tab(self, chart: Any) -> Any:
+        """Return the chart with the widgets that ask for it."""
+        button = self._button("chart button", "compute where it squeals")
+        button.align = "end"
+        return column(row(self.over, button, sizing_mode="stretch_width"), chart, sizing_mode="stretch_both")
+
+    def chart_range(self) -> tuple[str, float, float]:
+        """Return the parameter across the chart, and its range."""
+        name = self.over.value
+        low, high, step = next(ranges[name] for ranges in _SLIDERS.values() if name in ranges)
+        return name, max(low, step) if name == "alpha" else low, high
+
     def _button(self, name: str, label: str, **arguments: Any) -> Button:
         button = Button(label=label, name=name, sizing_mode="stretch_width", **arguments)
         button.on_event(ButtonClick, lambda: self.clicked.add(name))
@@ -173,6 +190,10 @@ class Controls:
             used = bool(chosen & set(FIELDS[name]["law"].split(", ")))
             if self.plant[name].visible != used:
                 self.plant[name].visible = used
+        names = [name for tab in ("oscillator", "friction") for name in _SLIDERS[tab] if self.plant[name].visible]
+        if self.over.options != names[1:]:  # the belt speed is the other axis
+            self.over.options = names[1:]
+            self.over.value = self.over.value if self.over.value in names[1:] else names[1]
 
     def say(self, text: str) -> None:
         """Show a text (HTML) below the widgets."""
@@ -206,6 +227,10 @@ class Drawing:
         self.line = ColumnDataSource({"x": [-5.0, 5.0], "v": [0.0, 0.0]}, name="line")
         self.curve = source("curve", "belt_speed amplitude")
         self.point = source("point", "belt_speed amplitude color marker")
+        columns = " ".join(CHART_COLUMNS)
+        self.regions, self.borders = source("regions", f"{columns} kind"), source("borders", f"{columns} curve")
+        self.own = source("own", "x y")
+        self.charted: ChartPicture | None = None
         self.basins = source("basins", "image x y dw dh")
         self.spring = source("spring", "x y size")
         self.marks = source("marks", "x y")
@@ -218,6 +243,7 @@ class Drawing:
         self._draw_portrait()
         self._draw_history()
         self._draw_amplitudes()
+        self._draw_chart()
         self.figures = [self.machine, self.portrait, self.displacement, self.action, self.amplitudes]
 
     def _figure(self, name: str, title: str, x: str, y: str, **arguments: Any) -> Any:
@@ -305,6 +331,29 @@ class Drawing:
         )
         self._place_legend(plot, "top_left")
         self.amplitudes = plot
+
+    def _draw_chart(self) -> None:
+        plot = self._figure("chart", "", "", "belt speed v_b", x_range=(0, 1), y_range=(0, 1))
+        plot.patches("x", "y", source=self.regions, color="color", line_width=0, legend_field="kind")
+        plot.multi_line(
+            "x", "y", source=self.borders, color="color", line_dash="dash", line_width=2.5, legend_field="curve"
+        )
+        plot.scatter("x", "y", source=self.own, size=13, marker="diamond", color=BLACK, legend_label="this plant")
+        self._place_legend(plot, "bottom_right")
+        self.chart = plot
+
+    def show_chart(self, picture: ChartPicture | None, plant: OscillatorParameters) -> None:
+        """Show a chart, or none, and where in it a plant lies."""
+        if picture is not self.charted:
+            self.charted = picture
+            for source, name in ((self.regions, "regions"), (self.borders, "borders")):
+                source.data = getattr(picture, name) if picture else {key: [] for key in source.data}
+            if picture:
+                self.chart.xaxis.axis_label = f"{picture.name}, {FIELDS[picture.name]['meaning']}"
+                for shown, (low, high) in zip((self.chart.x_range, self.chart.y_range), picture.reach, strict=True):
+                    shown.update(start=low, end=high)
+        place = {"x": [getattr(plant, picture.name)], "y": [plant.belt_speed]} if picture else {"x": [], "y": []}
+        self.own.data = place
 
     def look(self, centre: float, x_reach: float, v_reach: float) -> None:
         """Set the ranges of x and v that are shown."""
@@ -409,17 +458,28 @@ class Page:
         self.controls, self.drawing = Controls(self.plant), Drawing()
         self.plant_work = Latest(self._show_plant, self._wake)
         self.basin_work = Latest(self._show_basins, self._wake)
+        # In another process: following curves is mostly Python, which would hold up this one's frames.
+        processes = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+        self.chart_work = Latest(self._show_chart, self._wake, processes)
         self.ended = False
         self.ticks = self.idle_ticks = 0
         self.requests = self.controls.requests()
         self.drawing.show_plant(PlantPicture.of(self.plant))
         for widget in self.controls.plant.values():
             widget.on_change("value", lambda attr, old, new: self._wake())
-        for root in (self.controls.layout, self.drawing.readout, *self.drawing.figures):
+        *figures, amplitudes = self.drawing.figures
+        panels = {"amplitude": amplitudes, "where it squeals": self.controls.chart_tab(self.drawing.chart)}
+        curves = Tabs(
+            tabs=[TabPanel(title=title, child=child) for title, child in panels.items()],
+            name="curves",
+            sizing_mode="stretch_both",
+        )
+        roots = [*figures, curves]
+        for root in (self.controls.layout, self.drawing.readout, *roots):
             document.add_root(root)
         document.title = "sd_friction_env explorer"
         document.template = _TEMPLATE
-        document.template_variables["figures"] = [plot.name for plot in self.drawing.figures]
+        document.template_variables["figures"] = [root.name for root in roots]
         document.add_periodic_callback(self.tick, _TICK)
         document.on_session_destroyed(lambda context: self.end())
 
@@ -441,8 +501,8 @@ class Page:
                 self.plant = self.plant.replace(**{name: asked[name] for name in self.controls.plant})
                 self.plant_work.ask(functools.partial(PlantPicture.after_compilation, self.plant))
             self.requests |= {name: asked[name] for name in self.controls.plant}
-        self.plant_work.poll()
-        self.basin_work.poll()
+        for work in (self.plant_work, self.basin_work, self.chart_work):
+            work.poll()
 
     def _follow_control(self) -> None:
         """Do what else the widgets ask for now, and not what they asked for in between."""
@@ -479,11 +539,18 @@ class Page:
             plant = self.plant
             self.basin_work.ask(lambda: (plant, *basin_picture(plant)))
 
+        if "chart button" in clicked:
+            controls.say("Computing where it squeals ...")
+            self.chart_work.ask(functools.partial(chart_picture, self.plant, controls.chart_range()))
+
     def _show_plant(self, work: Future[PlantPicture]) -> None:
         with self.controls.errors_shown():
             picture = work.result()
             self.live.change(**dataclasses.asdict(picture.parameters))
             self.drawing.show_plant(picture)
+            charted = self.drawing.charted
+            holds = charted is not None and charted.holds_for(self.plant)
+            self.drawing.show_chart(charted if holds else None, self.plant)
 
     def _show_basins(self, work: Future[tuple[OscillatorParameters, NDArray[np.float64], str]]) -> None:
         with self.controls.errors_shown():
@@ -492,11 +559,18 @@ class Page:
                 self.drawing.show_basins(image)
                 self.controls.say(words)
 
+    def _show_chart(self, work: Future[ChartPicture]) -> None:
+        with self.controls.errors_shown():
+            picture = work.result()
+            if picture.holds_for(self.plant):  # else it has been changed meanwhile
+                self.drawing.show_chart(picture, self.plant)
+                self.controls.say(html.escape(picture.words))
+
     def end(self) -> None:
         """Stop all work: the browser has left, or nobody has touched the page for long."""
         self.ended = True
-        self.plant_work.end()
-        self.basin_work.end()
+        for work in (self.plant_work, self.basin_work, self.chart_work):
+            work.end()
 
     def tick(self) -> None:
         """Do what the user asks for; advance a little, and show it."""

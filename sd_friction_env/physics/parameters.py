@@ -95,7 +95,7 @@ def checked_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
     return str(value)
 
 
-def checked_range(over: Any, choices: tuple[str, ...]) -> tuple[str, float, float]:
+def checked_range(over: Any, choices: tuple[str, ...], argument: str = "over") -> tuple[str, float, float]:
     """Return ``over``, (name, low, high), with the name of a parameter among ``choices`` and its range checked.
 
     Raises:
@@ -103,11 +103,11 @@ def checked_range(over: Any, choices: tuple[str, ...]) -> tuple[str, float, floa
         ValueError: if the name is unknown, or low < high do not lie in the parameter's range.
     """
     if not isinstance(over, tuple | list) or len(over) != 3 or not isinstance(over[0], str):
-        raise TypeError(f"over must be (name, low, high), got {brief_repr(over)}")
-    name = checked_choice("over", over[0], choices)
-    low, high = (checked_number(f"over, {name},", value, *RANGES.get(name, (-1e12, 1e12))) for value in over[1:])
+        raise TypeError(f"{argument} must be (name, low, high), got {brief_repr(over)}")
+    name = checked_choice(argument, over[0], choices)
+    low, high = (checked_number(f"{argument}, {name},", value, *RANGES.get(name, (-1e12, 1e12))) for value in over[1:])
     if not low < high:
-        raise ValueError(f"over must be (name, low, high) with low < high, got {over!r}")
+        raise ValueError(f"{argument} must be (name, low, high) with low < high, got {over!r}")
     return name, low, high
 
 

@@ -30,7 +30,16 @@ from sd_friction_env.physics.chunks import (
     stream_chunks,
 )
 from sd_friction_env.physics.curves import amplitude_curve, attractor_curves, checked_belt_speeds, cycle_table
-from sd_friction_env.physics.forced import Direction, bifurcation_diagram, response_curve
+from sd_friction_env.physics.forced import (
+    Direction,
+    bifurcation_diagram,
+    forced_orbit,
+    orbit_branches,
+    response_curve,
+)
+from sd_friction_env.physics.forced.branches import MOST_DOUBLINGS, checked_branch, without_branch
+from sd_friction_env.physics.forced.sections import MOST_CYCLES, stroboscope
+from sd_friction_env.physics.orbits import OrbitError
 from sd_friction_env.physics.parameters import STATE_LIMIT, OscillatorParameters, checked_count, checked_number
 from sd_friction_env.physics.shocks import basin_integrity, check_search, without_attractors
 from sd_friction_env.physics.starts import checked_grid
@@ -48,6 +57,7 @@ __all__ = [
     "basin_file",
     "basin_sweep",
     "bifurcation_sweep",
+    "branch_sweep",
     "integrity_sweep",
     "response_sweep",
     "run_chunks",
@@ -229,6 +239,53 @@ def response_sweep(
     """Return the response curve of each plant, as :func:`forced.response_curve` does, bit for bit; one chunk each."""
     arguments = {"direction": direction, "cycles": cycles, "transient": transient}
     return _diagram_sweep("response", plants, name, values, engine, arguments)
+
+
+def branch_sweep(
+    plants: Sequence[OscillatorParameters],
+    over: tuple[str, float, float],
+    engine: Engine,
+    *,
+    x: float = 0.0,
+    v: float | None = None,
+    transient: int = 200,
+    points: int = 100,
+    doublings: int = 0,
+) -> list[Table]:
+    """Return the branches that begin at the orbit of each plant, as :func:`forced.orbit_branches` does; one chunk each.
+
+    A plant whose motion settles on no orbit has one row of kind "none" with the reason.
+
+    Args:
+        plants: (n,) oscillators; each branch starts at the oscillator's own value of the parameter.
+        engine: where it runs.
+        x, v, transient: of the motion, as of :func:`forced.forced_orbit`.
+        over, points, doublings: as of ``orbit_branches``.
+
+    Raises:
+        TypeError, ValueError: if an argument is not of the type or in the range above, before anything is computed.
+        SweepError: see :func:`run_chunks`.
+    """
+    checked_count("transient", transient, 0, MOST_CYCLES)
+    checked_count("doublings", doublings, 0, MOST_DOUBLINGS)
+    for plant in plants:
+        stroboscope(plant, None, repeats=True).checked_start(x, v)
+        over, points = checked_branch(plant, over, points)
+    start, how = {"x": x, "v": v, "transient": transient}, {"points": points, "doublings": doublings}
+    described = [dataclasses.asdict(plant) for plant in plants]
+    description = {"what": "branches", "plants": described, "over": list(over), "start": start, **how}
+    results = run_chunks(_branch_chunk, [(p, over, start, how) for p in plants], engine, description=description)
+    return [Table(columns, {"over": over[0], "range": list(over[1:]), **how}) for columns in results]
+
+
+def _branch_chunk(
+    chunk: tuple[OscillatorParameters, tuple[str, float, float], dict[str, Any], dict[str, Any]],
+) -> Columns:
+    plant, over, start, how = chunk
+    try:
+        return dict(orbit_branches(forced_orbit(plant, **start), over, **how))
+    except OrbitError as error:
+        return dict(without_branch(over[0], plant.values[over[0]], str(error)))
 
 
 def integrity_sweep(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env.extras import extra
 from sd_friction_env.physics.basins import Basins
-from sd_friction_env.physics.charts import slabs_of
+from sd_friction_env.physics.charts import filled_regions
 from sd_friction_env.physics.forced import ForcedBasins
 from sd_friction_env.physics.orbits import LimitCycle
 from sd_friction_env.physics.simulation import Trajectory
@@ -54,6 +54,18 @@ BORDERS = {
     "v_b0": {"color": BLUE, "linestyle": "-", "label": "$v_{b0}$: stick ends (grazing)"},
     "v_b1": {"color": VERMILION, "linestyle": (0, (4, 1.2)), "label": "$v_{b1}$: steady slip unstable (Hopf)"},
     "fold": {"color": BLACK, "linestyle": (0, (1, 1)), "label": "fold of pure-slip cycles"},
+}
+CHART_MARKERS = {"turn": "s", "Bautin": "D", "grazing fold": "^", "meeting": "o"}
+BRANCH_MARKERS = {
+    "fold": "s",
+    "branch point": "P",
+    "flip": "D",
+    "Neimark-Sacker": "*",
+    "grazing-sliding": "^",
+    "crossing-sliding": "v",
+    "switching-sliding": "<",
+    "adding-sliding": ">",
+    "grazing": "o",
 }
 LABELS = {
     "alpha": r"anchor height $\alpha$",
@@ -328,32 +340,54 @@ def draw_bifurcation(axis: "Axes", diagram: Table) -> None:
     axis.legend(fontsize=8, frameon=False, loc="best")
 
 
+def _mark_special(axis: "Axes", kinds: Any, x: Any, y: Any, markers: Mapping[str, str]) -> dict[str, Any]:
+    """Mark the points whose kind has a marker; return the handles by kind."""
+    handles: dict[str, Any] = {}
+    for kind, marker in markers.items():
+        part = kinds == kind
+        if part.any():
+            mark: dict[str, Any] = {"linestyle": "none", "color": BLACK, "markersize": 5.5, "label": kind}
+            handles[kind] = axis.plot(x[part], y[part], marker=marker, **mark)[0]
+    return handles
+
+
+@house_style()
+def draw_branches(axis: "Axes", branches: Table) -> None:
+    """Draw the section points of :func:`forced.orbit_branches`, stable orbits solid and unstable dashed, with a marker
+    at each bifurcation; over :func:`draw_bifurcation` they go through its points."""
+    name = branches.metadata["over"]
+    for branch, cycle in sorted(set(zip(branches["branch"].tolist(), branches["cycle"].tolist(), strict=True))):
+        part = (branches["branch"] == branch) & (branches["cycle"] == cycle)
+        x, stable, special = branches["x"][part], branches["stable"][part], branches["kind"][part] != "point"
+        for label, drawn, line in (("stable", stable, "-"), ("unstable", ~stable, (0, (4, 1.2)))):
+            shown, style = np.where(drawn | special, x, np.nan), {"color": PURPLE, "linewidth": 1.6, "linestyle": line}
+            axis.plot(branches[name][part], shown, label="" if branch + cycle > 0 else label, **style)  # type: ignore[arg-type]
+    _mark_special(axis, branches["kind"], branches[name], branches["x"], BRANCH_MARKERS)
+    axis.set_xlabel(label_of(name))
+    axis.set_ylabel("$x$ on the section")
+    axis.legend(fontsize=8, frameon=False, loc="best")
+
+
 @house_style()
 def draw_chart(axis: "Axes", chart: Table) -> None:
     """Draw a chart of :func:`stability_chart`: its regions, its curves, and a marker at each special point."""
     from matplotlib.patches import Patch
 
-    name = chart.metadata["over"]
-    over, speeds = chart[name], chart["belt_speed"]
-    kinds = iter(chart["kind"][(chart["curve"] == "region") & (chart["kind"] != "rest")].tolist())
+    name, against = chart.metadata["over"], chart.metadata.get("against", "belt_speed")
+    over, other = chart[name], chart[against]
     handles: dict[str, Any] = {}
-    for slab in slabs_of(chart):
-        for low, high in zip(slab.bounds, slab.bounds[1:], strict=False):
-            kind = next(kinds)
-            axis.fill_between(slab.values, low, high, color=REGIONS[kind], linewidth=0.0)
-            handles[kind] = Patch(facecolor=REGIONS[kind], edgecolor="0.6", label=kind)
+    for kind, values, low, high in filled_regions(chart):
+        axis.fill_between(values, low, high, color=REGIONS[kind], linewidth=0.0)
+        handles[kind] = Patch(facecolor=REGIONS[kind], edgecolor="0.6", label=kind)
     for curve, style in BORDERS.items():
         for branch in np.unique(chart["branch"][(chart["curve"] == curve) & (chart["branch"] >= 0)]):
             part = (chart["curve"] == curve) & (chart["branch"] == branch)
-            handles[curve] = axis.plot(over[part], speeds[part], linewidth=2.0, **style)[0]  # type: ignore[arg-type]
-    for kind, marker in (("turn", "s"), ("Bautin", "D"), ("grazing fold", "^"), ("meeting", "o")):
-        part = chart["kind"] == kind
-        if part.any():
-            mark: dict[str, Any] = {"linestyle": "none", "color": BLACK, "markersize": 5.5, "label": kind}
-            handles[kind] = axis.plot(over[part], speeds[part], marker=marker, **mark)[0]
-    axis.set_ylim(bottom=0.0)
+            handles[curve] = axis.plot(over[part], other[part], linewidth=2.0, **style)[0]  # type: ignore[arg-type]
+    handles |= _mark_special(axis, chart["kind"], over, other, CHART_MARKERS)
+    if against == "belt_speed":
+        axis.set_ylim(bottom=0.0)
     axis.margins(x=0.0, y=0.0)
-    axis.set(xlabel=label_of(name), ylabel=label_of("belt_speed"))
+    axis.set(xlabel=label_of(name), ylabel=label_of(against))
     axis.legend(handles=list(handles.values()), fontsize=8, loc="best")
 
 

@@ -26,7 +26,13 @@ from sd_friction_env.control import pretrained
 from sd_friction_env.control.pretrained import pretrained_file
 from sd_friction_env.physics.charts import stability_chart
 from sd_friction_env.physics.curves import refined_curve
-from sd_friction_env.physics.forced import bifurcation_diagram, lyapunov_exponent, poincare_section
+from sd_friction_env.physics.forced import (
+    bifurcation_diagram,
+    forced_orbit,
+    lyapunov_exponent,
+    orbit_branches,
+    poincare_section,
+)
 from sd_friction_env.physics.parameters import OscillatorParameters
 from sd_friction_env.storage import load_arrays
 
@@ -149,15 +155,54 @@ def test_a_chart_is_the_functions(tmp_path, capsys):
     assert np.array_equal(table["belt_speed"], wanted["belt_speed"])
     assert table["kind"].tolist() == wanted["kind"].tolist()
     assert plot.read_bytes().startswith(b"\x89PNG")
+    fixed = ["g1", "1.0:1.2", "--against", "beta", "0.05:0.15", "--belt-speed", "0.3"]
+    assert main([*command, *fixed, "--out", str(out), "--plot", str(plot)]) == 0
+    assert Table.from_csv(out).metadata["against"] == "beta"
     for bad, said in (
         (["beta", "0.1"], "'0.1' must be LOW:HIGH"),
         (["beta", "0.1:0.02"], "low < high"),
         (["mass", "0:1"], "over must be one of"),
-        (["beta", "0.02:0.1", "--against", "alpha"], "against must be one of"),
+        (["beta", "0.02:0.1", "--against", "g1"], "--against must be belt_speed, or NAME LOW:HIGH, got 'g1'"),
+        (["beta", "0.02:0.1", "--against", "g1", "1"], "--against g1: '1' must be LOW:HIGH"),
+        (["beta", "0.02:0.1", "--against", "beta", "0:1"], "against must be one of"),
         (["beta", "0.02:0.1", "--belt-speed", "0.2"], "an axis of the chart"),
     ):
         assert main([*command, *bad]) == 2
         assert said in capsys.readouterr().err
+
+
+def test_branches_are_the_functions_and_refused_before_anything_is_computed(tmp_path, capsys):
+    out, plot = tmp_path / "branches.csv", tmp_path / "branches.png"
+    over, drive = ["--over", "force-amplitude"], ["--force-amplitude", "0.12"]
+    kept = ["--folder", str(tmp_path / "kept"), "--out", str(out), "--plot", str(plot)]
+    command = ["branches", "--alpha", "0.7", "--points", "20"]
+    assert main([*command, *drive, *over, "0.1:0.15", "--doubled", *kept]) == 0
+    orbit = forced_orbit(OscillatorParameters(alpha=0.7, force_amplitude=0.12))
+    wanted = orbit_branches(orbit, ("force_amplitude", 0.1, 0.15), points=20, doublings=1)
+    table = Table.from_csv(out)
+    assert list(table) == list(wanted)
+    assert set(table["branch"]) == {0, 1}
+    assert all(np.array_equal(table[name], wanted[name]) for name in ("x", "force_amplitude", "kind", "reason"))
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    # A motion that does not settle has a row, too.
+    assert main(["branches", "--geometry", "cubic", "--alpha", "0.1", *drive, *over, "0.1:0.15", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    assert row["kind"] == "none"
+    assert "does not settle" in row["reason"]
+    for bad, said in (
+        ([*drive, *over, "0.1"], "'0.1' must be LOW:HIGH"),
+        ([*drive, *over, "0.2:0.3"], "force_amplitude of the start must be"),
+        ([*drive, "--over", "mass", "0:1"], "over must be one of"),
+        ([*drive, "--over", "ripple-frequency", "0.5:1"], "does not use the parameter 'ripple_frequency'"),
+        ([*over, "0:1"], "parameters must be excited"),
+        (["--force-amplitude", "0.1", "0.2", *over, "0:1"], "where the branch starts: give one value"),
+        ([*drive, *over, "0:1", "--doubled", "11"], "doublings must be"),
+        ([*drive, *over, "0:1", "--transient", "-1"], "transient must be"),
+        ([*drive, *over, "0:1", "--start", "nan", "0"], "x must be"),
+    ):
+        assert main(["branches", *bad, "--folder", str(tmp_path / "none")]) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from bokeh.document import Document
 from bokeh.events import ButtonClick
 
 from scripts import explorer_latency
-from sd_friction_env import OscillatorParameters, amplitude_curve, limit_cycle, load_pretrained
+from sd_friction_env import OscillatorParameters, amplitude_curve, limit_cycle, load_pretrained, stability_chart
 from sd_friction_env.cli.main import main
 from sd_friction_env.explorer import model
 from sd_friction_env.explorer import page as page_module
@@ -32,6 +32,7 @@ from sd_friction_env.explorer.model import (
     Live,
     PlantPicture,
     basin_picture,
+    chart_picture,
     controllers,
     passive_curve,
     passive_cycle,
@@ -43,7 +44,7 @@ from sd_friction_env.explorer.server import make_server, served_hosts
 def follow(page):
     """Let a page do all that its widgets ask for."""
     page.tick()
-    for work in (page.plant_work, page.basin_work):
+    for work in (page.plant_work, page.basin_work, page.chart_work):
         while work.running is not None:
             futures.wait([work.running])
             page.tick()
@@ -415,6 +416,38 @@ def test_many_clicks_are_one_piece_of_work_and_a_changed_plant_forgets_it():
     image, words = basin_picture(OscillatorParameters(alpha=0.2))
     assert np.array_equal(page.drawing.basins.data["image"][0], image, equal_nan=True)
     assert page.controls.message.text == words
+
+
+def test_the_chart_is_computed_on_demand_and_marks_the_plant_while_it_lies_in_it():
+    page = Page(Document())
+    by_hand = page.chart_work.executor = ByHand()
+    assert page.controls.over.options == ["alpha", "g1", "beta", "mu_s", "mu_m", "v_m"]
+    page.controls.over.value = "beta"
+    click(page, "chart button")
+    page.tick()
+    assert "Computing where it squeals" in page.controls.message.text
+    page.tick()  # the animation goes on meanwhile
+    assert len(page.drawing.path.data["t"]) > 0
+    by_hand.finish()
+    page.tick()
+    chart = stability_chart(OscillatorParameters(), ("beta", 0.0, 0.15), points=30)
+    borders = page.drawing.borders.data
+    assert borders["curve"] == ["v_b0", "v_b1"]
+    assert np.array_equal(borders["y"][0], chart["belt_speed"][(chart["curve"] == "v_b0") & (chart["branch"] == 0)])
+    assert set(page.drawing.regions.data["kind"]) == {"stick-slip", "pure slip", "steady slip"}
+    assert (page.drawing.own.data["x"], page.drawing.own.data["y"]) == ([0.05], [0.2])
+    page.controls.plant["beta"].value, page.controls.plant["belt_speed"].value = 0.1, 0.3
+    follow(page)
+    assert (page.drawing.own.data["x"], page.drawing.own.data["y"]) == ([0.1], [0.3])
+    page.controls.plant["mu_s"].value = 0.3  # now it is another chart
+    follow(page)
+    assert page.drawing.own.data["x"] == page.drawing.borders.data["x"] == []
+
+
+def test_a_chart_without_curves_says_why():
+    picture = chart_picture(OscillatorParameters(friction="coulomb", geometry="linear", beta=0.0), ("g1", 0.5, 1.0))
+    assert "persists up to the greatest belt speed" in picture.words
+    assert picture.borders["x"] == []
 
 
 def test_clicks_and_switches_between_two_frames_are_done_once(monkeypatch):

@@ -9,8 +9,8 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from sd_friction_env import OscillatorParameters, kernel
-from sd_friction_env.physics.forced import doubled_orbit, follow_orbit, forced_orbit
-from sd_friction_env.physics.forced.branches import LOCAL_MAPS, OrbitProblem
+from sd_friction_env.physics.forced import doubled_orbit, follow_orbit, forced_orbit, orbit_branches, poincare_section
+from sd_friction_env.physics.forced.branches import LOCAL_MAPS, OrbitProblem, begins_at
 
 STRIBECK = OscillatorParameters(alpha=0.7, belt_speed=0.2, force_amplitude=0.12, force_frequency=1.0)
 COULOMB = OscillatorParameters(
@@ -124,8 +124,38 @@ def test_at_a_flip_an_orbit_of_twice_the_period_begins(stribeck):
     i = int(np.argmin(np.abs(branch.table["force_amplitude"] - after.force_amplitude)))
     assert abs(branch.orbits[i].x_max - direct.x_max) < 0.02
     assert any(o.stable and o.multiple == 2 for o in branch.orbits)
+    assert begins_at(branch, orbit)
+    assert not begins_at(branch, stribeck.orbits[0])
     with pytest.raises(ValueError, match="orbit must be at a flip"):
         doubled_orbit(stribeck.orbits[0], "force_amplitude")
+
+
+def test_periods_double_in_a_cascade_and_end_where_they_are_halved(stribeck):
+    table = orbit_branches(forced_orbit(STRIBECK), ("force_amplitude", 0.1, 0.15), points=20, doublings=2)
+    rows = [row for row in table.rows() if row["cycle"] == 0]
+    assert sorted({(row["branch"], row["multiple"]) for row in rows}) == [(0, 1), (1, 2), (2, 4)]
+    flips = [row["force_amplitude"] for row in rows if row["kind"] == "flip" and row["multiple"] < 4]
+    halved = [row["force_amplitude"] for row in rows if row["reason"] == "the period is halved"]
+    # The orbits of four cycles begin at a flip and end where those of two graze the belt.
+    (graze,) = [r["force_amplitude"] for r in rows if r["kind"] == "grazing-sliding" and r["multiple"] == 2]
+    assert sorted(halved) == pytest.approx(sorted([*flips, graze]), abs=1e-7)
+    assert flips[0] == pytest.approx(of_kind(stribeck, "flip")[0][0]["force_amplitude"], abs=1e-10)
+    # x and v of each cycle are the section's points, which the excitation maps onto one another.
+    row = next(row for row in rows if row["multiple"] == 4 and row["kind"] == "point")
+    chosen = (table["branch"] == 2) & (table["force_amplitude"] == row["force_amplitude"])
+    p = STRIBECK.replace(force_amplitude=row["force_amplitude"])
+    section = poincare_section(p, row["x"], row["v"], cycles=4, transient=0)
+    assert np.roll(section["x"], 1) == pytest.approx(table["x"][chosen], abs=1e-9)
+    with pytest.raises(ValueError, match="doublings must be"):
+        orbit_branches(forced_orbit(STRIBECK), ("force_amplitude", 0.1, 0.15), doublings=-1)
+
+
+def test_a_flip_without_other_orbits_has_the_reason():
+    value = 0.126803628053  # the flip, at the end of the range: the orbits of twice the period lie beyond
+    table = orbit_branches(forced_orbit(STRIBECK), ("force_amplitude", 0.1, value + 1e-9), points=10, doublings=1)
+    (reason,) = table["reason"][table["kind"] == "flip"]
+    assert "force_amplitude of the start must be" in reason
+    assert set(table["branch"]) == {0}
 
 
 def cone_and_approach(orbit):

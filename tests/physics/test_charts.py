@@ -50,6 +50,41 @@ def test_curves_over_other_parameters_are_the_direct_roots(name):
     assert difference_from_roots(CUBIC, chart, "v_b1", 5) < 1e-8
 
 
+def test_curves_at_a_fixed_belt_speed_pass_it():
+    plant = CUBIC.replace(belt_speed=0.35)
+    chart = stability_chart(plant, ("g1", 0.85, 1.1), ("mu_m", 0.05, 0.18), points=10)
+    for curve, speed in DIRECT.items():
+        part = (chart["curve"] == curve) & (chart["branch"] >= 0)
+        values = list(zip(chart["g1"][part].tolist(), chart["mu_m"][part].tolist(), strict=True))
+        assert len(values) > 9
+        speeds = [speed(plant.replace(g1=g1, mu_m=mu_m)) for g1, mu_m in values[::3]]
+        assert np.abs(np.array(speeds) - 0.35).max() < 1e-8
+    regions = chart["kind"][chart["curve"] == "region"].tolist()
+    assert regions == ["stick-slip", "pure slip", "steady slip"]
+    assert chart.metadata["against_range"] == [0.05, 0.18]
+
+
+@pytest.mark.slow
+def test_two_parameters_have_the_closed_form_of_gaussian_friction_and_its_fold():
+    # v_b1: 2 beta = g1 (mu_s - mu_k) 2 v/v_0^2 exp(-v^2/v_0^2) of a linear spring.
+    plant = GAUSSIAN.replace(belt_speed=0.75)
+    chart = stability_chart(plant, ("g1", 0.8, 1.2), ("beta", 0.02, 0.2), points=10)
+    part = (chart["curve"] == "v_b1") & (chart["branch"] >= 0)
+    slope = 0.2 * 0.75 / plant.v_0**2 * math.exp(-((0.75 / plant.v_0) ** 2))
+    assert np.allclose(chart["beta"][part], slope * chart["g1"][part], rtol=0.0, atol=1e-11)
+    folds = (chart["curve"] == "fold") & (chart["branch"] >= 0)
+    g1, beta = (float(chart[name][folds][3]) for name in ("g1", "beta"))
+    gaps = (-1e-4, 1e-4)
+    assert [len(slip_cycles(plant.replace(g1=g1, beta=beta + gap))) for gap in gaps] == [2, 0]
+    assert "bistable" in chart["kind"]
+
+
+def test_a_curve_that_does_not_pass_the_belt_speed_says_so():
+    chart = stability_chart(LINEAR.replace(belt_speed=2.0), ("g1", 0.5, 1.0), ("beta", 0.05, 0.1), points=10)
+    assert set(chart["kind"]) == {"none"}
+    assert all("belt_speed = 2 is on the curve at no beta in [0.05, 0.1]" in reason for reason in chart["reason"])
+
+
 def test_the_linear_belt_has_its_closed_form():
     chart = stability_chart(LINEAR, ("beta", 0.01, 0.1), points=20)
     beta, v_b1 = curve_of(chart, "v_b1")
@@ -128,13 +163,17 @@ def test_what_is_not_there_has_a_row_that_says_why():
         (TypeError, r"over must be \(name, low, high\)", {"over": "alpha"}),
         (ValueError, "low < high", {"over": ("alpha", 1.0, 0.5)}),
         (TypeError, "over, alpha, must be a real number", {"over": ("alpha", "a", 0.5)}),
-        (ValueError, "against must be one of 'belt_speed'", {"against": "g1"}),
+        (ValueError, "against must be 'belt_speed' or", {"against": "g1"}),
+        (TypeError, r"against must be \(name, low, high\)", {"against": 3}),
+        (ValueError, "against must be one of", {"against": ("alpha", 0.1, 0.2)}),
+        (ValueError, "low < high", {"against": ("g1", 0.2, 0.1)}),
+        (ValueError, "belt_speed must be", {"parameters": CUBIC.replace(belt_speed=0.0), "against": ("g1", 0.5, 1.0)}),
         (ValueError, "points must be", {"points": 3}),
     ],
 )
 def test_arguments_are_checked(error, message, arguments):
     with pytest.raises(error, match=message):
-        stability_chart(CUBIC, **arguments)
+        stability_chart(**{"parameters": CUBIC, **arguments})
     with pytest.raises(TypeError, match="parameters must be OscillatorParameters"):
         stability_chart({})
     with pytest.raises(ValueError, match="without excitation"):

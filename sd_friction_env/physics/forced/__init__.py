@@ -8,7 +8,7 @@ exist: such events are counted in ``singular_events``, and passed over.
 """
 
 from sd_friction_env.physics.forced.basins import LOST_CONTACT, UNDECIDED, ForcedBasins, forced_basins
-from sd_friction_env.physics.forced.branches import OrbitBranch, doubled_orbit, follow_orbit
+from sd_friction_env.physics.forced.branches import OrbitBranch, doubled_orbit, follow_orbit, orbit_branches
 from sd_friction_env.physics.forced.diagrams import Direction, bifurcation_diagram, response_curve
 from sd_friction_env.physics.forced.exponents import LyapunovExponent, lyapunov_exponent
 from sd_friction_env.physics.forced.orbits import ForcedOrbit, forced_orbit
@@ -30,6 +30,7 @@ __all__ = [
     "forced_basins",
     "forced_orbit",
     "lyapunov_exponent",
+    "orbit_branches",
     "poincare_section",
     "response_curve",
 ]

@@ -38,12 +38,15 @@ _ROUNDING = 1e-12  # of a parameter, in its range
 _JUMP = 1e-3  # residual at a test function's change of sign that is no zero of it
 _SAME = 1e-7  # distance of section points of one orbit
 _CLOSED = "the curve is closed"
+_HALVING = "the period is halved"
+_HALF, _REPEATS = 1e-4, 1e-10  # distance of points half a period apart: near where it is halved, and beyond a graze
 _NEAR = "an event nears the section"
 _MISSED = 1e-6  # by more than this a sliding bifurcation's condition is not met: the map jumps
 _FLIP = 1e-4  # distance from -1 of the multiplier of an orbit that is doubled
+_AT_FLIP = 1e-3  # distance of section points within which a branch begins at an orbit, at a parameter this much nearer
 _LETTERS = {kernel.SLIP_BACKWARD: "b", kernel.STICK: "s", kernel.SLIP_FORWARD: "f"}
 
-
+MOST_DOUBLINGS = 10
 # The leading order in which the maps on both sides of a sliding bifurcation differ, and what comes next (di Bernardo,
 # Kowalczyk and Nordmark, 2002, Physica D 170).
 LOCAL_MAPS = {
@@ -144,6 +147,11 @@ class OrbitProblem:
             matrix[:, 2] -= duration / self.value(y) * np.array([motion.v, self._acceleration(y, motion, duration)])
         self._seen = y.copy(), matrix - np.eye(2, 3)
         return self._seen[1]
+
+    def half(self, y: FloatArray) -> FloatArray:
+        """Return where half a lap ends minus where it begins."""
+        end = self._lap(y, np.empty((kernel.TANGENT_ROWS, 0)), None, 0.5)
+        return np.array([end.x - y[0], end.v - y[1]])
 
     def _acceleration(self, y: FloatArray, motion: Any, time: float) -> float:
         """Return the acceleration at the end of a lap, in slip."""
@@ -274,10 +282,8 @@ def follow_orbit(start: ForcedOrbit, over: tuple[str, float, float], *, points: 
     if not isinstance(start, ForcedOrbit):
         raise TypeError(f"start must be a ForcedOrbit, see forced_orbit, got {brief_repr(start)}")
     p = start.parameters
-    name, low, high = checked_range(over, tuple(p.values))
-    _check_use(p, name)
-    value = checked_number(f"{name} of the start", p.values[name], low, high)
-    points = checked_count("points", points, 10, 10_000)
+    (name, low, high), points = checked_branch(p, over, points)
+    value = float(p.values[name])
     y, upwards = np.array([start.x, start.v, value]), np.array([0.0, 0.0, 1.0])
     try:
         at_start = OrbitProblem(start, name, (low, high), start.phase / start.multiple)
@@ -295,6 +301,14 @@ def follow_orbit(start: ForcedOrbit, over: tuple[str, float, float], *, points: 
     rows = [_row(name, place, orbit) for place, orbit in zip(places, orbits, strict=True)]
     metadata = {"over": name, "range": [low, high], "multiple": start.multiple, "points": points}
     return OrbitBranch(Table({column: np.array([row[column] for row in rows]) for column in rows[0]}, metadata), orbits)
+
+
+def checked_branch(parameters: OscillatorParameters, over: Any, points: Any) -> tuple[tuple[str, float, float], int]:
+    """Return the arguments of :func:`follow_orbit` for an oscillator at the start, checked."""
+    name, low, high = checked_range(over, tuple(parameters.values))
+    _check_use(parameters, name)
+    checked_number(f"{name} of the start", parameters.values[name], low, high)
+    return (name, low, high), checked_count("points", points, 10, 10_000)
 
 
 def _check_use(parameters: OscillatorParameters, name: str) -> None:
@@ -331,22 +345,29 @@ def _one_way(problem: OrbitProblem, y: FloatArray, along: FloatArray, longest: f
     places: list[Place] = []
     value, left = y[2], f"left after {_MOST_PIECES} changes of the section or of the sequence of slips and sticks"
     for piece in range(_MOST_PIECES):
+        if problem.orbit.multiple % 2 == 0 and np.abs(problem.half(y)).max() < _REPEATS:
+            reason = _HALVING
+            break
         problem.modes = problem.sequence(y)
         limits = {2: (*problem.limits, problem.name)}
         try:
-            branch = follow(problem, y, along, longest=longest, limits=limits, tests=_tests(problem))
+            branch = follow(problem, y, along, longest=longest, limits=limits, tests=_tests(problem, y))
         except BranchEndError as error:
             if not places:
                 raise
             reason = str(error)
             break
-        found = [_named(problem, point) for point in branch.points[1 if piece else 0 :] if point.residual < _JUMP]
+        halved = _halved(problem, branch.points)
+        listed = [point for point in halved or branch.points if point.kind != _HALVING and point.residual < _JUMP]
+        found = [_named(problem, point) for point in listed[1 if piece else 0 :]]
         places += [Place(problem, point, problem.modes) for point in found]
         last, reason = branch.points[-1], branch.reason
         closing = _closing(problem, branch.points, value) if piece else None
         if closing is not None:
             places, reason = places[: len(places) - len(found) + closing], _CLOSED
-        if reason.startswith((problem.name, _CLOSED, "left")):
+        elif halved is not None:
+            reason = _HALVING
+        if reason.startswith((problem.name, _CLOSED, _HALVING, "left")):
             break
         near = reason == _NEAR
         change = None if near else _change(problem, last, longest)
@@ -380,16 +401,29 @@ def _closing(problem: OrbitProblem, points: list[Point], value: float) -> int | 
     return None
 
 
-def _tests(problem: OrbitProblem) -> dict[str, Any]:
+def _tests(problem: OrbitProblem, begin: FloatArray) -> dict[str, Any]:
     def bordered(y: FloatArray, tangent: FloatArray) -> float:
         return float(np.linalg.det(np.vstack((problem.slopes(y) * problem.scale, tangent))))
 
-    return {
+    tests: dict[str, Any] = {
         "fold": lambda _, tangent: float(tangent[2]),
         "branch point": bordered,
         "flip": lambda y, _: float(np.linalg.det(problem.map(y) + np.eye(2))),
         "Neimark-Sacker": lambda y, _: float(np.linalg.det(problem.map(y))) - 1.0,
     }
+    if problem.orbit.multiple % 2 == 0:
+        apart = problem.half(begin)
+        tests[_HALVING] = lambda y, _: float(problem.half(y) @ apart)
+    return tests
+
+
+def _halved(problem: OrbitProblem, points: list[Point]) -> list[Point] | None:
+    """Return the points up to an orbit of half the period, or None: beyond, all comes again half a period later."""
+    for i, point in enumerate(points):
+        if point.kind == _HALVING and np.abs(problem.half(point.y)).max() < _HALF:
+            before = [j for j in range(i) if points[j].kind in ("start", "point")]
+            return [*points[: before[-1] + 1], point._replace(kind="point")]
+    return None
 
 
 def _named(problem: OrbitProblem, point: Point) -> Point:
@@ -521,3 +555,65 @@ def doubled_orbit(orbit: ForcedOrbit, name: str, *, step: float = 1e-3) -> Force
         return twice.orbit_of(correct(twice, y + step * direction, direction))
     except BranchEndError as error:
         raise OrbitError(f"no orbit of twice the period: {error}; {p}") from None
+
+
+def orbit_branches(
+    start: ForcedOrbit, over: tuple[str, float, float], *, points: int = 100, doublings: int = 0
+) -> Table:
+    """Follow an orbit over a parameter and, from its flips on, the orbits of twice the period, and theirs.
+
+    Args:
+        start, over, points: as of :func:`follow_orbit`.
+        doublings: times that the period is doubled, in [0, 10].
+
+    Returns:
+        A table with a row for each orbit and cycle of the excitation in it: branch (0: that of the start), multiple,
+        cycle, and the columns of :class:`OrbitBranch` with x and v of this cycle. A flip at which no other orbit was
+        found has the reason.
+
+    Raises:
+        TypeError, ValueError, OrbitError: as :func:`follow_orbit`.
+    """
+    doublings = checked_count("doublings", doublings, 0, MOST_DOUBLINGS)
+    branches = [follow_orbit(start, over, points=points)]
+    parts: list[dict[str, Any]] = []
+    for branch in branches:  # which grow in number meanwhile
+        reasons = branch.table["reason"].tolist()
+        doubled = branch.table.metadata["multiple"] < start.multiple * 2**doublings
+        for i in np.flatnonzero((branch.table["kind"] == "flip") & doubled).tolist():
+            flip = branch.orbits[i]
+            if any(begins_at(other, flip) for other in branches):
+                continue
+            try:
+                branches.append(follow_orbit(doubled_orbit(flip, over[0]), over, points=points))
+            except ValueError as error:
+                reasons[i] = str(error)
+        counts = [len(orbit.points) for orbit in branch.orbits]
+        rows = np.repeat(np.arange(len(counts)), counts)
+        columns: dict[str, Any] = {"branch": np.full(len(rows), len(parts))}
+        columns["multiple"] = np.full(len(rows), branch.table.metadata["multiple"])
+        columns["cycle"] = np.concatenate([np.arange(count) for count in counts])
+        columns |= {name: column[rows] for name, column in branch.table.items()} | {"reason": np.array(reasons)[rows]}
+        columns["x"], columns["v"] = np.concatenate([orbit.points for orbit in branch.orbits]).T
+        parts.append(columns)
+    metadata = {"over": over[0], "range": list(over[1:]), "points": points}
+    return Table({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, metadata)
+
+
+def begins_at(branch: OrbitBranch, flip: ForcedOrbit) -> bool:
+    """Return whether a branch of orbits of twice the period passes an orbit at a flip."""
+    name, (low, high) = branch.table.metadata["over"], branch.table.metadata["range"]
+    near = np.abs(branch.table[name] - flip.parameters.values[name]) < 1e-3 * _AT_FLIP * (high - low)
+    return branch.table.metadata["multiple"] == 2 * flip.multiple and any(
+        np.abs(branch.orbits[i].points - (flip.x, flip.v)).max(axis=1).min() < _AT_FLIP
+        for i in np.flatnonzero(near).tolist()
+    )
+
+
+def without_branch(name: str, value: float, reason: str) -> Table:
+    """Return the row, of kind "none", in place of those of :func:`orbit_branches` where there is no orbit to follow."""
+    row: dict[str, Any] = {"branch": -1, "multiple": 0, "cycle": 0, "kind": "none", name: value}
+    row |= dict.fromkeys(("x", "v", "amplitude", "x_min", "x_max", "period", "stick_fraction"), math.nan)
+    row |= {"sequence": "", "stable": False, "multiplier": math.nan, "multiplier_imag": math.nan}
+    row |= dict.fromkeys(("second_multiplier", "residual", "condition"), math.nan)
+    return Table({column: np.array([cell]) for column, cell in (row | {"reason": reason}).items()})

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.io import wavfile
 
+from scripts import signals_and_shocks
 from sd_friction_env import OscillatorParameters, limit_cycle, simulate
 from sd_friction_env.cli.main import main
 from sd_friction_env.control import sound
@@ -35,6 +36,12 @@ def test_the_file_has_the_pitch_of_the_limit_cycle_and_control_silences_it(argum
     assert signals.harmonics(before, 1.0 / rate, count=1)["frequency"][0] == pytest.approx(pitch, rel=1e-3)
     assert np.abs(after[len(after) // 2 :]).max() <= 1.0 < 0.1 * np.abs(before).max()
     assert "fundamental in the sound" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("plant", signals_and_shocks.HEARD)
+def test_the_written_sound_of_every_plant_has_its_pitch(plant, tmp_path):
+    heard, played = signals_and_shocks.heard_pitch(plant, tmp_path)
+    assert heard == pytest.approx(played, rel=1e-3)
 
 
 def test_a_rig_is_played_at_its_own_frequency_if_that_is_audible():

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from sd_friction_env import OscillatorParameters, kernel
 from sd_friction_env.physics.forced import doubled_orbit, follow_orbit, forced_orbit, orbit_branches, poincare_section
-from sd_friction_env.physics.forced.branches import LOCAL_MAPS, OrbitProblem, begins_at
+from sd_friction_env.physics.forced.branches import OrbitProblem, begins_at
 
 STRIBECK = OscillatorParameters(alpha=0.7, belt_speed=0.2, force_amplitude=0.12, force_frequency=1.0)
 COULOMB = OscillatorParameters(
@@ -191,38 +191,6 @@ def test_each_sliding_bifurcation_meets_its_condition(stribeck, kind):
             "crossing-sliding": {"bfs", "bf"},
         }[kind]
     )
-
-
-def order_of_map(orbit, name):
-    """The power of the distance with which the map past a sliding bifurcation leaves the one before it."""
-    value = orbit.parameters.values[name]
-    problem = OrbitProblem(orbit, name, (0.5 * value, 1.5 * value), orbit.phase / orbit.multiple)
-    problem, y, _ = problem.moved(np.array([orbit.x, orbit.v, value]), np.zeros(3))
-    way = np.array([0.0, 0.0, 1.0])
-    if len(problem.sequence(y + 1e-3 * way)) < len(problem.sequence(y - 1e-3 * way)):
-        way = -way  # the map with fewer events is smooth: a polynomial continues it
-    nodes = 1e-2 * np.cos(np.pi * (np.arange(12) + 0.5) / 12) - 1.001e-2
-    smooth = np.polynomial.Chebyshev.fit(nodes, [problem.residual(y + node * way)[0] for node in nodes], 9)
-    steps = np.array([1e-3, 2e-3])
-    apart = [abs(problem.residual(y + step * way)[0] - smooth(step)) for step in steps]
-    return math.log(apart[1] / apart[0]) / math.log(2.0)
-
-
-@pytest.mark.parametrize("kind", ["grazing-sliding", "switching-sliding", "crossing-sliding"])
-def test_the_maps_on_both_sides_part_in_the_order_of_theory(kind):
-    p = COULOMB.replace(force_frequency=1.3)
-    (_, orbit), *_ = of_kind(follow_orbit(forced_orbit(p), ("force_amplitude", 0.05, 0.8), points=20), kind)
-    assert order_of_map(orbit, "force_amplitude") == pytest.approx(LOCAL_MAPS[kind][0], abs=0.2)
-
-
-def test_a_cut_stick_changes_the_map_in_second_order():
-    (_, orbit), *_ = of_kind(
-        follow_orbit(
-            forced_orbit(STANDING.replace(force_frequency=0.25), 1.0), ("force_frequency", 0.16, 0.3), points=20
-        ),
-        "adding-sliding",
-    )
-    assert order_of_map(orbit, "force_frequency") == pytest.approx(LOCAL_MAPS["adding-sliding"][0], abs=0.2)
 
 
 @pytest.mark.parametrize("name", ["force_frequency", "force_amplitude", "force_phase", "belt_speed", "mu_s", "alpha"])

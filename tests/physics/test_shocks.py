@@ -3,45 +3,25 @@
 import numpy as np
 import pytest
 
+from scripts import signals_and_shocks
 from sd_friction_env import OscillatorParameters, attractors, basin_grid
 from sd_friction_env.physics.basins import basins
 from sd_friction_env.physics.shocks import basin_integrity, smallest_shock
 from sd_friction_env.physics.sweeps import Engine, basin_file, integrity_sweep
 
 EXACT = OscillatorParameters()
-CUBIC = EXACT.replace(geometry="cubic")
 BISTABLE = EXACT.replace(geometry="linear", friction="exponential", mu_s=1.0, mu_k=0.5, v_0=0.5)
 
 
-@pytest.mark.parametrize(
-    "plant",
-    [
-        EXACT.replace(alpha=0.5, belt_speed=0.43),
-        EXACT.replace(alpha=0.7, belt_speed=0.46),
-        CUBIC.replace(alpha=0.5, belt_speed=0.46),
-        CUBIC.replace(alpha=0.7, belt_speed=0.46),
-        BISTABLE.replace(belt_speed=1.3),
-        BISTABLE.replace(belt_speed=1.7),
-    ],
-)
+@pytest.mark.parametrize("plant", signals_and_shocks.SHAKEN)
 def test_the_smallest_shock_is_below_brute_force_and_within_its_step(plant):
-    step, phases = 0.02, 32
     found = attractors(plant)
     assert len(found) == 2
     for label, cycle in enumerate(found):
         shock = smallest_shock(cycle, starts=4000)
-        size = np.arange(-2.0, 2.0 + step, step)
-        dx, dv = np.meshgrid(size, size)
-        sizes = np.hypot(dx, dv)
-        near = sizes < shock.size + 3.0 * step
-        smallest = np.inf
-        for phase in np.arange(phases if cycle.period > 0.0 else 1) / phases:
-            x, v = cycle.state(phase)
-            labels = basins(plant, x + dx[near], v + dv[near]).labels
-            leaves = (labels != label) & (labels != -2)
-            smallest = min(smallest, sizes[near][leaves].min(initial=np.inf))
+        smallest = signals_and_shocks.smallest_on_grid(plant, cycle, label, shock)
         assert shock.size <= smallest
-        assert smallest - shock.size < np.sqrt(2.0) * step
+        assert smallest - shock.size < np.sqrt(2.0) * signals_and_shocks.STEP
         after, inside = (basins(plant, shock.x + k * shock.dx, shock.v + k * shock.dv).labels for k in (1.0, 0.999))
         assert (int(after), int(inside)) == (shock.reaches, label)
 

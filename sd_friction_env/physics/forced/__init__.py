@@ -11,6 +11,7 @@ from sd_friction_env.physics.forced.basins import LOST_CONTACT, UNDECIDED, Force
 from sd_friction_env.physics.forced.branches import OrbitBranch, doubled_orbit, follow_orbit, orbit_branches
 from sd_friction_env.physics.forced.diagrams import Direction, bifurcation_diagram, response_curve
 from sd_friction_env.physics.forced.exponents import LyapunovExponent, lyapunov_exponent
+from sd_friction_env.physics.forced.local_maps import SlidingMap, sliding_map
 from sd_friction_env.physics.forced.orbits import ForcedOrbit, forced_orbit
 from sd_friction_env.physics.forced.sections import dithered_amplitude, drive_period, poincare_section
 
@@ -22,6 +23,7 @@ __all__ = [
     "ForcedOrbit",
     "LyapunovExponent",
     "OrbitBranch",
+    "SlidingMap",
     "bifurcation_diagram",
     "dithered_amplitude",
     "doubled_orbit",
@@ -33,4 +35,5 @@ __all__ = [
     "orbit_branches",
     "poincare_section",
     "response_curve",
+    "sliding_map",
 ]

@@ -47,14 +47,6 @@ _AT_FLIP = 1e-3  # distance of section points within which a branch begins at an
 _LETTERS = {kernel.SLIP_BACKWARD: "b", kernel.STICK: "s", kernel.SLIP_FORWARD: "f"}
 
 MOST_DOUBLINGS = 10
-# The leading order in which the maps on both sides of a sliding bifurcation differ, and what comes next (di Bernardo,
-# Kowalczyk and Nordmark, 2002, Physica D 170).
-LOCAL_MAPS = {
-    "grazing-sliding": (1.0, "linear on each side, 3/2 next"),
-    "crossing-sliding": (2.0, "quadratic"),
-    "adding-sliding": (2.0, "quadratic, 5/2 next"),
-    "switching-sliding": (3.0, "cubic"),
-}
 
 
 class Arc(NamedTuple):
@@ -103,13 +95,15 @@ class OrbitProblem:
             return self.orbit.period
         return self.orbit.period * float(getattr(self.orbit.parameters, self.name) / self.value(y))
 
-    def _shifted(self, y: FloatArray) -> OscillatorParameters:
+    def shifted(self, y: FloatArray) -> OscillatorParameters:
+        """Return the oscillator at y whose excitation is at t = 0 what it is at the section."""
         return at_phase(self.oscillator(y), self.share * self.duration(y))
 
-    def _lap(self, y: FloatArray, tangents: FloatArray, changes: FloatArray | None, share: float = 1.0) -> Any:
+    def lap(self, y: FloatArray, tangents: FloatArray, changes: FloatArray | None, share: float = 1.0) -> Any:
+        """Return a share of a lap (``kernel.TangentMotion``), and carry tangents along it in place."""
         if not np.abs(y[:2]).max() <= STATE_LIMIT:
             raise BranchEndError(f"the state leaves [-{STATE_LIMIT:g}, {STATE_LIMIT:g}]")
-        p = self._shifted(y)
+        p = self.shifted(y)
         state, belt = kernel.State(float(y[0]), float(y[1])), kernel.steady(p.belt_speed)
         plant = p.excited_plant(0.0)
         time = share * self.duration(y)
@@ -121,7 +115,7 @@ class OrbitProblem:
     def residual(self, y: FloatArray) -> FloatArray:
         """Return where a lap ends minus where it begins; past a limit of the parameter, extended along a line."""
         past = 0.0 if self.limits[0] <= y[2] <= self.limits[1] else float(y[2]) - self.value(y)
-        motion = self._lap(y, np.empty((kernel.TANGENT_ROWS, 0)), None)
+        motion = self.lap(y, np.empty((kernel.TANGENT_ROWS, 0)), None)
         missed = np.array([motion.x - y[0], motion.v - y[1]])
         return missed + past * self.jacobian(y)[:, 2] if past else missed
 
@@ -139,8 +133,8 @@ class OrbitProblem:
         if self.name == "belt_speed":
             tangents[kernel.TANGENT_BELT, 2] = 1.0
         else:
-            changes = self._shifted(y).plant_change(self.name, excited=True)[None, :]
-        motion = self._lap(y, tangents, changes)
+            changes = self.shifted(y).plant_change(self.name, excited=True)[None, :]
+        motion = self.lap(y, tangents, changes)
         matrix = tangents[:2].copy()
         if self.name in self.rates:
             duration = self.duration(y)
@@ -150,12 +144,12 @@ class OrbitProblem:
 
     def half(self, y: FloatArray) -> FloatArray:
         """Return where half a lap ends minus where it begins."""
-        end = self._lap(y, np.empty((kernel.TANGENT_ROWS, 0)), None, 0.5)
+        end = self.lap(y, np.empty((kernel.TANGENT_ROWS, 0)), None, 0.5)
         return np.array([end.x - y[0], end.v - y[1]])
 
     def _acceleration(self, y: FloatArray, motion: Any, time: float) -> float:
         """Return the acceleration at the end of a lap, in slip."""
-        p = self._shifted(y)
+        p = self.shifted(y)
         plant = kernel.at_time(p.excited_plant(0.0), time)
         x, v = plant.excitation.to_belt_frame(motion.x, motion.v, p.belt_speed)
         a = kernel.slip_acceleration(plant, motion.mode, kernel.State(x, v), kernel.steady(p.belt_speed))
@@ -171,7 +165,7 @@ class OrbitProblem:
 
     def arcs(self, y: FloatArray) -> list[Arc]:
         """Return the slips and sticks of a lap from the section on, the last of which goes on in the first."""
-        p, duration = self._shifted(y), self.duration(y)
+        p, duration = self.shifted(y), self.duration(y)
         events, belt = np.empty((kernel.MAX_EVENTS, 4)), kernel.steady(p.belt_speed)
         plant = p.excited_plant(0.0)
         motion = kernel.advance(plant, kernel.State(float(y[0]), float(y[1])), belt, duration, events)
@@ -210,7 +204,7 @@ class OrbitProblem:
             raise BranchEndError(f"the slips become shorter than {2.0 * _SHORTEST_SLIP:g} of the period")
 
         def there(y: FloatArray) -> FloatArray:
-            end = self._lap(y, np.empty((kernel.TANGENT_ROWS, 0)), None, share)
+            end = self.lap(y, np.empty((kernel.TANGENT_ROWS, 0)), None, share)
             return np.array([end.x, end.v, y[2]])
 
         begin = there(y)
@@ -479,16 +473,20 @@ def _change(problem: OrbitProblem, last: Point, longest: float) -> Place | None:
     return Place(problem, Point(best, last.tangent, residual, {}, kind), kept, condition)
 
 
+def shortest_arc(arcs: list[Arc]) -> int:
+    """Return the index of the shortest arc of a lap that neither begins nor ends at the section, or 0."""
+    return min(range(1, len(arcs) - 1), key=lambda i: arcs[i].end - arcs[i].begin, default=0)
+
+
 def sliding_kind(arcs: list[Arc]) -> tuple[str, float]:
     """Return the bifurcation at which the shortest of an orbit's arcs vanishes, and by how much it is missed.
 
     The excess over the cone grows linearly in time at its border: the depth by which a slip passes v_rel = 0 is
     excess * duration/2 where a stick begins, and the height by which a stick's load passes the cone slope * duration/6.
     """
-    inner = range(1, len(arcs) - 1)
-    if not inner:
+    i = shortest_arc(arcs)
+    if i == 0:
         return "other", math.nan
-    i = min(inner, key=lambda i: arcs[i].end - arcs[i].begin)
     before, arc, after = arcs[i - 1 : i + 2]
     duration = arc.end - arc.begin
     if arc.mode == kernel.STICK:

@@ -359,10 +359,10 @@ class GrazingBorder(Border):
             time -= end.a / end.jerk
 
 
-def grazes_at_breakaway(plant: Any) -> bool:
-    """Return whether friction is continuous at rest, so that an orbit grazes where stick ends."""
-    limit = plant.friction.breakaway_coefficient(kernel.SLIP_BACKWARD)
-    return bool(abs(limit + plant.friction.coefficient(kernel.SLIP_BACKWARD, 0.0)) <= 1e-12 * max(1.0, limit))
+def grazes_at_breakaway(plant: Any, mode: int = kernel.SLIP_BACKWARD) -> bool:
+    """Return whether friction is continuous at rest, in a mode, so that an orbit grazes where stick ends."""
+    limit = plant.friction.breakaway_coefficient(mode)
+    return bool(abs(limit - mode * plant.friction.coefficient(mode, 0.0)) <= 1e-12 * max(1.0, limit))
 
 
 class FoldBorder(Border):

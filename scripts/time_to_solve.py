@@ -6,9 +6,8 @@
 Contenders: PPO of Stable-Baselines3 ("plain"), `sd-friction train`'s default ("fast") and, on belt, the default started
 from the threshold follower ("rule"). Each training has a process of its own and one thread; seed by seed they follow
 each other, so what slows the machine slows all, and a ratio is the median of the seeds' ratios to the first contender.
-After every 8,192 steps the agent is evaluated on the 50 validation starts. CPU seconds of these evaluations are not
-counted: a run has twenty of its own, about 1 s. Score: 0 passive on these starts, 1 the mean optimum of the
-evaluation starts, which are of the same kind.
+After every 8,192 steps the agent is scored on the 100 evaluation starts, as `sd-friction evaluate` does; the run keeps
+its best by the 50 validation starts. CPU seconds of neither are counted: a run has twenty evaluations, about 1 s.
 """
 
 import argparse
@@ -44,32 +43,28 @@ def measure(task: str, contender: str, seed: int) -> list[dict[str, float]]:
     env_id = TASKS[task][0]
     plan = make_plan(env_id, "ppo", seed=seed, eval_freq=EVAL_FREQ, **CONTENDERS[contender])
     rows: list[dict[str, float]] = []
-    uncounted, validate = 0.0, training.validate
+    uncounted, validate, seeds = 0.0, training.validate, evaluation.EVALUATION_SEEDS
 
-    def timed(*arguments: Any) -> dict[str, float]:
+    def timed(policy: Any, plan: Any) -> dict[str, float]:
         nonlocal uncounted
         began = time.process_time()
-        found = validate(*arguments)
+        found = validate(policy, plan)
+        table = evaluation.evaluate(policy, env_id, seeds, passive=evaluation.passive_episodes(env_id, seeds))
         uncounted += time.process_time() - began
-        rows.append({"cpu": time.process_time() - uncounted, **found})
+        means = {name: float(table[name].mean()) for name in ("return", "suppressed")}
+        rows.append({"cpu": time.process_time() - uncounted, "validation": found["credited_return"], **means})
         return found
 
-    training.validate = timed  # type: ignore[assignment]
+    training.validate = timed
     with tempfile.TemporaryDirectory() as folder:
         result = training.train(plan, Path(folder) / "run", checkpoint_freq=plan.steps // 20, progress=False)
-    passive = np.nansum(evaluation.passive_episodes(env_id, plan.validation_seeds).reward, axis=1).mean()
-    optimal = evaluation.optimal_returns(env_id, evaluation.EVALUATION_SEEDS)
+    passive = np.nansum(evaluation.passive_episodes(env_id, seeds).reward, axis=1).mean()
+    optimal = evaluation.optimal_returns(env_id, seeds)
     assert optimal is not None
     gap = float(np.nanmean(optimal) - passive)
     steps = result.evaluations["steps"]
     return [
-        {
-            "steps": float(n),
-            "cpu": row["cpu"],
-            "score": (row["mean_return"] - passive) / gap,
-            "suppressed": row["suppressed"],
-        }
-        for n, row in zip(steps, rows, strict=True)
+        {"steps": float(n), "score": (row["return"] - passive) / gap, **row} for n, row in zip(steps, rows, strict=True)
     ]
 
 
@@ -96,7 +91,7 @@ def print_table(found: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) ->
             )
         for what in ("score", "suppressed", "cpu"):
             print(f"  {'at the end, ' + what:24}", "  ".join(f"{rows[-1][what]:6.3f}" for rows in runs))
-        best = [max(rows, key=lambda row: (row["suppressed"], row["score"])) for rows in runs]
+        best = [max(rows, key=lambda row: row["validation"]) for rows in runs]
         print(f"  {'best kept, score':24}", "  ".join(f"{row['score']:6.3f}" for row in best))
         print(f"  {'best kept, suppressed':24}", "  ".join(f"{row['suppressed']:6.3f}" for row in best), flush=True)
 

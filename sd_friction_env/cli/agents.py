@@ -87,5 +87,5 @@ def title_of(name: str, policy: Policy) -> str:
     """Return what a picture calls the controller that --agent names."""
     titles = {"passive": "no control", "rollout": "rollout of the threshold follower"}
     if isinstance(policy, NetworkPolicy):
-        return f"{str(policy.metadata.get('algorithm', 'trained')).upper()} agent"
+        return f"{policy.title} agent"
     return titles.get(name, name.replace("-", " "))

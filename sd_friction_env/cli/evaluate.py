@@ -109,7 +109,8 @@ def _agents_by_environment(options: argparse.Namespace) -> dict[tuple[str, str],
         else:
             raise UsageError(f"{str(path)!r} alone does not say its environment: name it with --task or --env-id")
         check_fit(path, policy, key[0], json.loads(key[1]))
-        tables.setdefault(key, {})[str(path)] = policy
+        start = policy.metadata.get("start_from")
+        tables.setdefault(key, {})[f"{path} (started from {start})" if start else str(path)] = policy
     if not tables:
         raise UsageError("nothing to evaluate: name run folders, or --task and --controller")
     return tables

@@ -260,6 +260,7 @@ class _Supervisor(BaseCallback):
             "env_id": self.plan.env_id,
             "env_kwargs": dict(self.plan.env_kwargs),
             "algorithm": self.plan.algorithm,
+            **({"start_from": self.plan.start_from} if self.plan.start_from else {}),
             "seed": self.plan.seed,
             "steps": self.num_timesteps if steps is None else steps,
             "sd_friction_env": sd_friction_env.__version__,

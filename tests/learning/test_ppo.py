@@ -181,7 +181,7 @@ def test_the_clone_acts_as_its_teacher_and_its_critic_knows_its_returns():
         assert abs(buffer.returns.mean() - buffer.values.mean()) < 0.1 * abs(buffer.returns.mean())
 
 
-def test_a_run_started_from_a_controller_says_so_and_resumes_to_the_same_weights(tmp_path):
+def test_a_run_started_from_a_controller_says_so_and_resumes_to_the_same_weights(tmp_path, capsys):
     small = {"n_steps": 60, "samples": 200, "actor_steps": 50, "critic_steps": 20}
     overrides = {"n_steps": 32, "n_epochs": 2}
     plan = warm_plan(
@@ -191,6 +191,9 @@ def test_a_run_started_from_a_controller_says_so_and_resumes_to_the_same_weights
     config = runs.load_config(tmp_path / "whole")
     assert config["start_from"] == "threshold-follower"
     assert config["hyperparameters"]["warm_start"]["samples"] == 200
+    assert runs.load_network(tmp_path / "whole").title == "PPO started from threshold-follower"
+    assert main(["evaluate", str(tmp_path / "whole"), "--episodes", "2"]) == 0
+    assert f"{tmp_path / 'whole'} (started from threshold-follower)" in capsys.readouterr().out
     calls = iter(range(1000))
     with pytest.raises(training.StoppedError):
         training.train(plan, tmp_path / "cut", progress=False, should_stop=lambda: next(calls) >= 70)

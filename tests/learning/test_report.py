@@ -17,7 +17,7 @@ from sd_friction_env.control.policies import ConstantPolicy, NetworkPolicy, Velo
 from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
 from sd_friction_env.learning import classical, evaluation, optimal, report, runs
 from sd_friction_env.learning.report import ENV_IDS, QUICK, Effort, Replay, Report
-from sd_friction_env.learning.report.agents import LEARNING
+from sd_friction_env.learning.report.agents import LEARNING, by_algorithm
 from sd_friction_env.storage import file_digest, write_json
 
 ROOT = Path(__file__).parents[2]
@@ -68,6 +68,12 @@ def test_runs_are_found_by_the_names_of_their_folders(agents_folder):
     assert [(a.algorithm, a.seed) for a in found] == [("ppo", 0), ("ppo", 2), ("ppo", 10), ("sac", 0)]
     assert len(left_out) == 1
     assert "'notes'" in left_out[0]
+
+
+def test_runs_that_started_from_a_controller_are_no_part_of_the_others(agents_folder):
+    make_run(agents_folder, "force-nominal-ppo-1", start_from="mine:Rule")
+    groups = {name: len(group) for name, group in by_algorithm(report.find_agents(agents_folder)[0])}
+    assert groups == {"PPO": 3, "PPO started from mine:Rule": 1, "SAC": 1}
 
 
 def test_a_run_that_is_not_what_its_name_says_or_is_damaged_is_refused(tmp_path):

@@ -93,6 +93,12 @@ class NetworkPolicy:
         return f"NetworkPolicy({sizes}{window}, {self.activation}, {self.output}{', ' + origin if origin else ''})"
 
     @property
+    def title(self) -> str:
+        """Algorithm that trained it and, unless it began with random weights, the controller that it started from."""
+        start = self.metadata.get("start_from")
+        return str(self.metadata.get("algorithm", "trained")).upper() + (f" started from {start}" if start else "")
+
+    @property
     def observation_size(self) -> int:
         """Entries of one observation."""
         return int(self.layers[0][0].shape[0]) // self.frames

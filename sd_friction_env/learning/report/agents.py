@@ -28,6 +28,7 @@ class Agent:
     task: str
     tier: str
     algorithm: str
+    title: str  # the algorithm in capitals, and what it started from if not random weights
     seed: int
     policy: Policy
     evaluations: Table
@@ -56,8 +57,9 @@ def find_agents(folder: Path) -> tuple[list[Agent], list[str]]:
         stored = (environment["id"].rpartition(":")[2], environment["kwargs"], config["algorithm"], config["seed"])
         if stored != expected:
             raise runs.RunFolderError(f"{str(place)!r} must hold {expected}, as its name says; it holds {stored}")
-        agents.append(Agent(place.name, task, tier, algorithm, int(seed), policy, _evaluations(place)))
-    return sorted(agents, key=lambda a: (TASKS.index(a.task), TIERS.index(a.tier), a.algorithm, a.seed)), left_out
+        title = algorithm.upper() + (f" started from {config['start_from']}" if "start_from" in config else "")
+        agents.append(Agent(place.name, task, tier, algorithm, title, int(seed), policy, _evaluations(place)))
+    return sorted(agents, key=lambda a: (TASKS.index(a.task), TIERS.index(a.tier), a.title, a.seed)), left_out
 
 
 def _evaluations(place: Path) -> Table:
@@ -72,6 +74,6 @@ def _evaluations(place: Path) -> Table:
 
 
 def by_algorithm(agents: Iterable[Agent]) -> Iterator[tuple[str, list[Agent]]]:
-    """Yield the name in capitals and the agents of each algorithm; agents must be in order."""
-    for algorithm, group in itertools.groupby(agents, key=lambda agent: agent.algorithm):
-        yield algorithm.upper(), list(group)
+    """Yield title and agents of each algorithm, those that started from a controller apart; agents must be in order."""
+    for title, group in itertools.groupby(agents, key=lambda agent: agent.title):
+        yield title, list(group)

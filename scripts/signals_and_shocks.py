@@ -66,7 +66,7 @@ def smallest_on_grid(
 
 def transfer(plant: OscillatorParameters, rates: NDArray[np.float64]) -> NDArray[np.complex128]:
     """Return the response of the linear oscillator without friction to its force, as complex amplitudes."""
-    return plant.force_amplitude / (1.0 - rates**2 + 2j * plant.beta * rates)
+    return np.asarray(plant.force_amplitude / (1.0 - rates**2 + 2j * plant.beta * rates), np.complex128)
 
 
 def label_file(starts: int, folder: str) -> str:

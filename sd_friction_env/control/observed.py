@@ -106,8 +106,9 @@ class ObservedRollout(ObservedRule):
         )
         actions = np.broadcast_to(first[..., None, :], now.shape[:-1])
         total = np.zeros(now.shape[:-1])
-        for _ in range(self.horizon):
-            now, rewards = self.observer.ensemble.step(now, parameters, actions)
+        for t in range(self.horizon):
+            steps = belief.steps[..., None, None] + t
+            now, rewards = self.observer.ensemble.step(now, parameters, actions, steps)
             total += rewards
             actions = as_taken(self._follow(now, parameters))
         return pick(first, np.argmax(np.nan_to_num(total, nan=-1e9).mean(axis=-2), axis=-1)), None

@@ -22,12 +22,14 @@ from sd_friction_env.control.policies.policy import broadcast_starts, checked_me
 from sd_friction_env.environments.batch import SDFrictionVectorEnv
 from sd_friction_env.environments.ensemble import Ensemble
 from sd_friction_env.environments.jacobian import step_with_jacobian
-from sd_friction_env.physics.parameters import EXCITATIONS, checked_count, checked_number
+from sd_friction_env.environments.task import drifted
+from sd_friction_env.physics.parameters import checked_count, checked_number
 
 _Floats = NDArray[np.float64]
 Memory = tuple[NDArray[Any], ...]
 
 _LEAST_NOISE = 1e-3  # of a reading: more exact ones leave too few particles of weight
+_LEAST_NUMBER = 1e-12
 _ON_BELT = 1e-9  # a correction moves a mass off the belt by rounding alone
 
 
@@ -38,11 +40,13 @@ class Belief(NamedTuple):
         states: (x, v, v_belt), shape (..., k, 3).
         parameters: the hidden ones, shape (..., k, d).
         weights: of the guesses, shape (..., k); their sum is 1.
+        steps: control intervals since the episode began, shape (...).
     """
 
     states: _Floats
     parameters: _Floats
     weights: _Floats
+    steps: NDArray[np.int64]
 
     @property
     def mean(self) -> tuple[_Floats, _Floats]:
@@ -84,16 +88,13 @@ class Observer:
     def from_env(cls, env: Any, **named: Any) -> Self:
         """Return the observer of an :class:`SDFrictionEnv`, wrapped or not; ``named`` are numbers of the class.
 
-        It knows of no excitation and of no drift.
-
         Raises:
             TypeError: if it is another kind of environment.
         """
         bare: Any = getattr(env, "unwrapped", None)
         if not hasattr(bare, "task") or not hasattr(bare, "nominal"):
             raise TypeError(f"env must be an SDFrictionEnv, got {env!r}")
-        hidden = (name for name in bare.task.randomise if name.partition("_")[0] not in EXCITATIONS)
-        ensemble = Ensemble(bare.nominal.unexcited, bare.task, tuple(hidden))
+        ensemble = Ensemble(bare.nominal, bare.task)
         return cls(ensemble, **({"noise": max(bare.task.sensor_noise, _LEAST_NOISE)} | named))
 
     def correct(
@@ -119,15 +120,15 @@ class Observer:
             guesses[begun], spread[begun] = self._begin(flat[begun])
         if new.any():
             guesses[new], spread[new] = self._update(flat[new], guesses[new], spread[new], steps[new])
-        states, parameters, weights = guesses[..., :3], guesses[..., 3 : self._first], self._weights(guesses, spread)
-        parts = (part.reshape(*shape, *part.shape[1:]) for part in (states, parameters, weights))
+        found = guesses[..., :3], guesses[..., 3 : self._first], self._weights(guesses, spread), steps
+        parts = (part.reshape((*shape, *part.shape[1:])) for part in found)
         return Belief(*parts), (steps, guesses, spread)
 
     def advance(self, memory: Memory, action: ArrayLike) -> Memory:
         """Return the memory a control interval later, after actions in [-1, 1], shape () or (n,)."""
         steps, guesses, spread = memory
         held = np.repeat(np.reshape(np.asarray(action, np.float64), (-1, 1)), guesses.shape[1], axis=1)
-        ends, spread = self._step(guesses, held, spread)
+        ends, spread = self._step(guesses, held, spread, steps)
         return steps + 1, ends, spread
 
     def read(self, observation: ArrayLike) -> _Floats:
@@ -158,7 +159,7 @@ class Observer:
     @property
     def _first(self) -> int:
         """The first column of the past."""
-        return 3 + len(self.ensemble.names)
+        return 3 + len(self.ensemble.ranges)
 
     @property
     def _width(self) -> int:
@@ -181,14 +182,22 @@ class Observer:
 
     def _admissible(self, guesses: _Floats, stuck: NDArray[np.bool_]) -> _Floats:
         """Put corrected guesses back into the ranges of the parameters, and those that stuck on the belt."""
-        for i, name in enumerate(self.ensemble.names):
-            guesses[..., 3 + i] = np.clip(guesses[..., 3 + i], *self.ensemble.task.randomise[name])
+        for i, (name, (low, high)) in enumerate(self.ensemble.ranges):
+            values = guesses[..., 3 + i]
+            if name.endswith("_phase"):  # to within half a turn of their mean direction
+                middle = np.angle(np.exp(1j * values).mean(axis=-1, keepdims=True))
+                values = middle + np.angle(np.exp(1j * (values - middle)))
+            else:  # without an amplitude there is no derivative by frequency and phase
+                values = np.clip(values, low or _LEAST_NUMBER, high)
+            guesses[..., 3 + i] = values
         guesses[..., 1] = np.where(stuck, guesses[..., 2], guesses[..., 1])
         return guesses
 
-    def _step(self, guesses: _Floats, actions: _Floats, spread: _Floats) -> tuple[_Floats, _Floats]:
+    def _step(
+        self, guesses: _Floats, actions: _Floats, spread: _Floats, steps: NDArray[np.int64]
+    ) -> tuple[_Floats, _Floats]:
         now = guesses[..., : self._first]
-        ends, _ = self.ensemble.step(now[..., :3], now[..., 3:], actions)
+        ends, _ = self.ensemble.step(now[..., :3], now[..., 3:], actions, steps[:, None])
         # A guess that cannot be advanced stays where it is.
         ends = np.where(np.isfinite(ends).all(axis=-1, keepdims=True), ends, now[..., :3])
         return self._row(np.concatenate([ends, now[..., 3:]], axis=-1), guesses[..., self._first :]), spread
@@ -236,11 +245,11 @@ class AlphaBetaFilter(Observer):
         return np.zeros((n, 1, self._width)), np.zeros((n, 0))
 
     def _begin(self, reading: _Floats) -> tuple[_Floats, _Floats]:
-        names, task, nominal = self.ensemble.names, self.ensemble.task, self.ensemble.nominal
+        nominal = self.ensemble.nominal
         now = np.zeros((len(reading), 1, self._first))
         now[..., 0] = reading[:, :1]
-        for i, name in enumerate(names):
-            now[..., 3 + i] = task.randomise[name][0] if name == "belt_speed" else nominal.values[name]
+        for i, (name, (low, _)) in enumerate(self.ensemble.ranges):
+            now[..., 3 + i] = low if name == "belt_speed" else nominal.values[name]
         now[..., 2] = self.belt_speed(now[..., 3:])
         return self._row(now), np.zeros((len(reading), 0))
 
@@ -260,7 +269,9 @@ class AlphaBetaFilter(Observer):
             guesses[..., 2] = ratio * guesses[..., column]
         return guesses, spread
 
-    def _step(self, guesses: _Floats, actions: _Floats, spread: _Floats) -> tuple[_Floats, _Floats]:
+    def _step(
+        self, guesses: _Floats, actions: _Floats, spread: _Floats, steps: NDArray[np.int64]
+    ) -> tuple[_Floats, _Floats]:
         task, now = self.ensemble.task, guesses[..., : self._first].copy()
         now[..., 0] += task.control_interval * now[..., 1]
         if task.actuator == "belt_speed":
@@ -291,8 +302,11 @@ class _FromPrior(Observer):
         envs = SDFrictionVectorEnv(self.prior_size, self.ensemble.nominal, **task)
         envs.np_random = np.random.default_rng(self.seed)
         _, info = envs.reset()
-        drawn = (info["parameters"][name] for name in self.ensemble.names)
-        return self._row(np.stack([info["x"], info["v"], info["v_belt"], *drawn], axis=-1))
+        drawn = [info["parameters"][name] for name in self.ensemble.names]
+        drift = self.ensemble.task.drift.values()
+        drawn += [envs.np_random.uniform(low, high, self.prior_size) for low, high in drift]
+        v_belt = info["parameters"]["belt_speed"]  # without its ripple
+        return self._row(np.stack([info["x"], info["v"], v_belt, *drawn], axis=-1))
 
     def _reweighted(self, guesses: _Floats, weights: _Floats, reading: _Floats, least: float) -> _Floats:
         """Return weights (n, k) after readings: by their likelihood, to such a power that ``least`` guesses count.
@@ -479,19 +493,27 @@ class KalmanFilter(_FromPrior):
             )
         return slope
 
-    def _step(self, guesses: _Floats, actions: _Floats, spread: _Floats) -> tuple[_Floats, _Floats]:
+    def _step(
+        self, guesses: _Floats, actions: _Floats, spread: _Floats, steps: NDArray[np.int64]
+    ) -> tuple[_Floats, _Floats]:
         ends, grown = np.empty_like(guesses), np.empty_like(spread)
-        first, seen, names = self._first, self._seen, self.ensemble.names
-        for i, (row, covariance) in enumerate(zip(guesses[:, 0], spread, strict=True)):
-            plant = self.ensemble.nominal.replace(**dict(zip(names, row[3:first].tolist(), strict=True)))
-            found = step_with_jacobian(row[:3], actions[i, 0], plant, self.ensemble.task, by=names)
+        first, seen, task = self._first, self._seen, self.ensemble.task
+        by = tuple(dict.fromkeys(name for name, _ in self.ensemble.ranges))
+        for i, (row, covariance, step) in enumerate(zip(guesses[:, 0], spread, steps.tolist(), strict=True)):
+            values = self.ensemble.values(row[3:first], step)
+            plant = self.ensemble.nominal.replace(**{name: float(values[name]) for name in by})
+            found = step_with_jacobian(row[:3], actions[i, 0], plant, task, by=by, time=step * task.control_interval)
             known = bool(np.isfinite(found.jacobian[:3]).all())
             state = found.state if known else row[:3]
             ends[i, 0] = self._row(np.concatenate([state, row[3:first]]), row[first:])
             change = np.zeros_like(covariance)
             change[:first, :first] = np.eye(first)
             if known:
-                change[:3, :3], change[:3, 3:first] = found.jacobian[:3, :3], found.jacobian[:3, 4:]
+                change[:3, :3] = found.jacobian[:3, :3]
+                for column, (name, _) in enumerate(self.ensemble.ranges, 3):
+                    late = float(column >= 3 + len(self.ensemble.names))
+                    share = drifted(1.0 - late, late, step, task.episode_steps) if name in task.drift else 1.0
+                    change[:3, column] = share * found.jacobian[:3, 4 + by.index(name)]
             change[first:-seen, first + seen :] = np.eye(self._width - first - seen)
             change[-seen:] = change[:seen]
             grown[i] = self.inflation * (change @ covariance @ change.T)

@@ -1,49 +1,69 @@
 """Control steps of many states, each with parameters of its own, by the batch's compiled code."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sd_friction_env import kernel
-from sd_friction_env.environments.task import FloatArray, Task
+from sd_friction_env.environments.task import FloatArray, Task, drifted
 from sd_friction_env.physics.parameters import EXCITATIONS, OscillatorParameters, plant_of
 
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Many oscillators under one task that differ in some parameters: what an observer of a hidden plant steps.
+    """Many oscillators under one task that differ in what it hides: what an observer of a hidden plant steps.
+
+    Hidden are the parameters that the task draws at a reset, and then the values that its drift reaches at the end.
 
     Attributes:
-        nominal: parameters of all oscillators but those named; without excitation.
-        task: actuator, control interval and reward weights.
-        names: of the parameters that differ, those of the last axis of ``parameters``.
-
-    Raises:
-        ValueError: if there is no such parameter, or it is one of an excitation.
+        nominal: parameters of all oscillators but the hidden ones.
+        task: what is drawn, actuator, control interval and reward weights.
     """
 
     nominal: OscillatorParameters
     task: Task
-    names: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        for name in self.names:
-            if name not in self.nominal.values or name.partition("_")[0] in EXCITATIONS:
-                raise ValueError(f"an ensemble cannot differ in {name!r}: it is no parameter of an unexcited plant")
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters that are drawn, the first columns of the hidden ones."""
+        return tuple(self.task.randomise)
 
-    def step(self, states: FloatArray, parameters: FloatArray, actions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    @property
+    def ranges(self) -> tuple[tuple[str, tuple[float, float]], ...]:
+        """Name and range of each hidden parameter: those that are drawn, then the ends of those that drift."""
+        return (*self.task.randomise.items(), *self.task.drift.items())
+
+    def values(self, parameters: FloatArray, steps: Any) -> dict[str, Any]:
+        """Return the numbers of plants by name, (...) where hidden, from the hidden parameters (..., len(ranges))."""
+        values: dict[str, Any] = dict(self.nominal.values)
+        hidden = iter(np.moveaxis(parameters, -1, 0))
+        values |= {name: next(hidden) for name in self.task.randomise}
+        return values | {
+            name: drifted(values[name], next(hidden), steps, self.task.episode_steps) for name in self.task.drift
+        }
+
+    def step(
+        self, states: FloatArray, parameters: FloatArray, actions: FloatArray, steps: NDArray[np.int64] | int = 0
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the states a control interval later, and the rewards; bit for bit those of the environment.
 
         Args:
-            states: (x, v, v_belt), shape (..., 3). parameters: shape (..., len(names)). actions: in [-1, 1], (...).
+            states: (x, v, v_belt), shape (..., 3); the belt's speed without a ripple. parameters: the hidden ones,
+                shape (..., len(ranges)). actions: in [-1, 1], (...). steps: intervals since the episode began, (...):
+                they matter to excitation and drift.
 
         Returns:
             States, (..., 3), and rewards, (...); both NaN where the mass loses contact or cannot be followed.
         """
-        n = actions.size
-        kind, values = self.nominal.unexcited.kind, dict(self.nominal.values)
-        example = plant_of(kind, values)
-        values.update(zip(self.names, parameters.reshape(n, -1).T, strict=True))
+        n, task = actions.size, self.task
+        count = np.broadcast_to(steps, actions.shape).reshape(n)
+        values = self.values(parameters.reshape(n, -1), count)
+        excited = any(f"{means}_amplitude" in task.randomise for means in EXCITATIONS)
+        kind = task.kind_of(self.nominal)
+        kind = kind._replace(excited=kind.excited or excited)
+        example = plant_of(kind, self.nominal.values)
         steppers, leaves = kernel.steppers(example), kernel.leaves_of(plant_of(kind, values), example)
         state = np.zeros((kernel.STATE_PLANT + len(leaves), n))
         state[kernel.STATE_X : kernel.STATE_X + 3] = states.reshape(n, 3).T
@@ -51,7 +71,8 @@ class Ensemble:
         for row, leaf in enumerate(leaves):
             state[kernel.STATE_PLANT + row] = leaf
         counts = np.zeros((kernel.COUNT_ROWS, n), np.int64)
-        numbers, codes = self.task.arrays()
+        counts[kernel.COUNT_STEPS] = count
+        numbers, codes = task.arrays()
         # The state is all that is read: no sensor, no statistics, no end of the episode.
         codes[kernel.TASK_EPISODE_STEPS] = codes[kernel.TASK_LATE_STEPS] = np.iinfo(np.int64).max
         codes[[kernel.TASK_SENSOR_DELAY, kernel.TASK_SEES_BELT, kernel.TASK_FULL_STATE, kernel.TASK_TRAVEL]] = False

@@ -45,7 +45,7 @@ def _observed(observer: str, controller: str, env: Any) -> ObservedPolicy:
     """Return the rule, its look-ahead or the trained agent ("rule", "rollout", "agent") on an observer of a name."""
     found = _OBSERVERS[observer].from_env(env)
     if controller == "agent":
-        tier = "randomised" if found.ensemble.names else "nominal"
+        tier = "randomised" if "belt_speed" in found.ensemble.names else "nominal"
         return ObservedNetwork(found, load_pretrained(environment_id("belt", tier)))
     return (ObservedRule if controller == "rule" else ObservedRollout).from_env(env, found)
 

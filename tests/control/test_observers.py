@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sd_friction_env import SDFrictionVectorEnv, load_pretrained
+from sd_friction_env import load_pretrained
 from sd_friction_env.control.observed import ObservedNetwork, ObservedRollout, ObservedRule
 from sd_friction_env.control.observers import (
     AlphaBetaFilter,
@@ -18,7 +18,9 @@ from sd_friction_env.control.observers import (
 from sd_friction_env.environments.ensemble import Ensemble
 from sd_friction_env.learning import evaluation
 
-NOMINAL, RANDOMISED, SENSED = (f"SDFriction/BeltSpeed{tier}-v0" for tier in ("", "Randomised", "Sensed"))
+NOMINAL, RANDOMISED, SENSED, DRIFTING, EXCITED = (
+    f"SDFriction/BeltSpeed{tier}-v0" for tier in ("", "Randomised", "Sensed", "Drifting", "Excited")
+)
 BLIND = {"sensor": "position", "sensor_noise": 0.005, "sensor_delay": 1}
 FILTERS = [AlphaBetaFilter, ParticleFilter, EnsembleKalmanFilter, KalmanFilter]
 SMALL = {"prior_size": 512}
@@ -47,24 +49,27 @@ def follow(observer, env, steps, seed=2_000_000, amplitude=1.0):
     return belief, truth, np.array([getattr(env.parameters, name) for name in env.task.randomise])
 
 
-def test_an_ensemble_steps_as_the_environment_does_bit_for_bit():
-    envs = SDFrictionVectorEnv(64, actuator="belt_speed", randomise=make().task.randomise, info_keys="all")
+@pytest.mark.parametrize("env_id", [RANDOMISED, DRIFTING, EXCITED])
+def test_an_ensemble_steps_as_the_environment_does_bit_for_bit(env_id):
+    envs = gym.make_vec(env_id, 64, info_keys="all").unwrapped
     _, info = envs.reset(seed=1)
-    ensemble = Ensemble(envs.nominal, envs.task, tuple(envs.task.randomise))
-    plants = np.stack([info["parameters"][name] for name in ensemble.names], axis=-1)
+    ensemble = Ensemble(envs.nominal, envs.task)
+    keys, episodes = np.array([(saved.key, saved.episode) for saved in envs.get_states()]).T
+    hidden = [info["parameters"][name] for name in ensemble.names]
+    plants = np.stack([*hidden, *envs.task.drift_ends(keys, episodes).values()], axis=-1)
     rng = np.random.default_rng(0)
     states = np.stack([info[name] for name in ("x", "v", "v_belt")], axis=-1)
-    for _ in range(100):
+    for t in range(100):
         actions = rng.uniform(-1.0, 1.0, 64).astype(np.float32)
-        states, rewards = ensemble.step(states, plants, actions.astype(float))
+        states, rewards = ensemble.step(states, plants, actions.astype(float), t)
         _, own, _, _, info = envs.step(actions[:, None])
         assert states.tobytes() == np.stack([info[name] for name in ("x", "v", "v_belt")], axis=-1).tobytes()
         assert rewards.tobytes() == own.tobytes()
 
 
 def test_a_mass_that_loses_contact_has_no_state():
-    env = make(parameters={"alpha": 0.6})
-    ensemble = Ensemble(env.nominal, env.task, ())
+    env = make(NOMINAL, parameters={"alpha": 0.6})
+    ensemble = Ensemble(env.nominal, env.task)
     states, rewards = ensemble.step(np.array([[9.0, 0.0, 0.2], [0.3, 0.2, 0.2]]), np.empty((2, 0)), np.zeros(2))
     lost = np.isnan(states).all(axis=-1) & np.isnan(rewards)
     assert not lost[1]
@@ -188,7 +193,7 @@ def test_weights_that_are_tempered_leave_the_share_that_is_asked_for():
 
 
 def test_the_belief_is_weighted():
-    belief = Belief(np.array([[1.0, 0, 0], [3.0, 0, 0]]), np.array([[2.0], [6.0]]), np.array([0.75, 0.25]))
+    belief = Belief(np.array([[1.0, 0, 0], [3.0, 0, 0]]), np.array([[2.0], [6.0]]), np.array([0.75, 0.25]), np.int64(0))
     assert belief.mean[0][0] == 1.5
     assert belief.mean[1][0] == 3.0
 
@@ -211,6 +216,39 @@ def test_a_belt_that_is_seen_by_its_position_alone_is_suppressed(kind, controlle
 
 
 @pytest.mark.parametrize(
+    ("env_id", "kind", "least"), [(DRIFTING, EnsembleKalmanFilter, 1.0), (EXCITED, ParticleFilter, 0.6)]
+)
+def test_a_plant_that_drifts_or_is_excited_is_suppressed(env_id, kind, least):
+    policy = ObservedRule.from_env(make(env_id), kind.from_env(make(env_id)))
+    assert evaluation.evaluate(policy, env_id, evaluation.VALIDATION_SEEDS[:8])["suppressed"].mean() >= least
+
+
+@pytest.mark.parametrize("env_id", [DRIFTING, EXCITED])
+def test_the_covariance_grows_by_the_derivatives_of_the_step(env_id):
+    observer = small(KalmanFilter, make(env_id), inflation=1.0)
+    row, step = observer.prior[3].copy(), np.array([200])
+    d = 3 + len(observer.ensemble.ranges)
+
+    def ends(column, change):
+        moved = row + change * np.eye(len(row))[column]
+        return observer.ensemble.step(moved[None, :3], moved[None, 3:d], np.array([0.3]), step)[0][0]
+
+    for column in range(3, d):
+        spread = np.outer(*[np.eye(len(row))[column]] * 2)
+        _, grown = observer._step(row[None, None], np.array([[0.3]]), spread[None], step)
+        slope = (ends(column, 1e-5) - ends(column, -1e-5)) / 2e-5
+        assert grown[0, column, :3] == pytest.approx(slope, rel=1e-4, abs=1e-9)
+        assert np.abs(slope).max() > 0.0
+
+
+def test_phases_are_close_to_each_other_across_a_full_turn():
+    observer = small(ParticleFilter, make(EXCITED))
+    guesses = observer.prior[None, :2].copy()
+    guesses[0, :, 5] = 0.1, 2.0 * np.pi - 0.3
+    assert np.ptp(observer._admissible(guesses, np.zeros((1, 2), bool))[0, :, 5]) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
     ("build", "message"),
     [
         (lambda: ParticleFilter.from_env(make(), particles=4), r"particles must be .* got 4"),
@@ -219,7 +257,6 @@ def test_a_belt_that_is_seen_by_its_position_alone_is_suppressed(kind, controlle
         (lambda: KalmanFilter.from_env(make(), inflation=0.5), r"inflation must be .* got 0.5"),
         (lambda: KalmanFilter.from_env(make(), noise=0.0), r"noise must be .* got 0.0"),
         (lambda: AlphaBetaFilter.from_env(make(), x_gain=float("nan")), r"x_gain must be .* got nan"),
-        (lambda: Ensemble(make().nominal, make().task, ("force_amplitude",)), "cannot differ in 'force_amplitude'"),
         (
             lambda: ObservedRule.from_env(
                 make("SDFriction/ForceSensed-v0"), KalmanFilter.from_env(make("SDFriction/ForceSensed-v0"))

@@ -101,8 +101,8 @@ def test_a_follower_of_another_version_of_the_environment_is_refused(tmp_path, m
     monkeypatch.setattr(pretrained, "RECURRENT", tmp_path)
     with pytest.raises(PolicyFileError, match=r"trained on another SDFriction/BeltSpeedBlind-v0 .*train_recurrent"):
         recurrent_follower(env)
-    with pytest.raises(ValueError, match="a recurrent follower was trained for SDFriction/BeltSpeedBlind-v0, got"):
-        recurrent_follower(gym.make("SDFriction/BeltSpeedExcited-v0"))
+    with pytest.raises(ValueError, match="a recurrent follower was trained for .*BeltSpeedBlind-v0, .* got"):
+        recurrent_follower(gym.make("SDFriction/BeltSpeedSensed-v0"))
 
 
 def test_training_with_a_seed_gives_the_same_network(monkeypatch):
@@ -116,7 +116,9 @@ def test_training_with_a_seed_gives_the_same_network(monkeypatch):
 
 def test_the_shipped_followers_do_what_their_pages_say():
     """Other machines multiply matrices in another order, hence the margin."""
-    for env_id, least in ((BLIND, 0.7), ("SDFriction/BeltSpeedBlindHard-v0", 0.3)):
+    leasts = {"Blind": 0.9, "BlindLate": 0.85, "BlindHard": 0.7, "Drifting": 0.85, "Excited": 0.4}
+    for tier, least in leasts.items():
+        env_id = f"SDFriction/BeltSpeed{tier}-v0"
         policy = recurrent_follower(gym.make(env_id))
         table = evaluation.evaluate(policy, env_id, evaluation.VALIDATION_SEEDS)
         assert table["suppressed"].mean() >= least, env_id

@@ -100,7 +100,7 @@ def outcomes(check: Check, seed: int, first: int) -> Generator[Outcome | None, N
     context = multiprocessing.get_context("spawn")
     while True:
         ours, theirs = context.Pipe(duplex=False)
-        worker = context.Process(target=_work, args=(check, seed, first, theirs), daemon=True)
+        worker = context.Process(target=_work, args=(check, seed, first, theirs))
         worker.start()
         theirs.close()
         is_ready = False

@@ -118,7 +118,7 @@ class Controls:
         self.controller = Select(options=controllers(), value=OFF, title="controller", name="controller", **fill)
         self.hand = Slider(title="action by hand", start=-1, end=1, step=0.05, value=0, name="hand", **fill)
         self.pause = Toggle(label="pause", name="pause", **fill)
-        self.over = Select(title="over", name="over", options=["alpha"], value="alpha", width=180)
+        self.over = Select(title="over", name="over", options=["alpha"], value="alpha", **fill)
         self.message = Div(name="message", stylesheets=[style], **fill)
         self.plant: dict[str, Any] = {
             "geometry": Select(options=list(GEOMETRIES), title="spring", name="geometry", **fill),
@@ -157,7 +157,7 @@ class Controls:
 
     def chart_tab(self, chart: Any) -> Any:
         """Return the chart with the widgets that ask for it."""
-        button = self._button("chart button", "compute where it squeals")
+        button = self._button("chart button", "compute")
         button.align = "end"
         return column(row(self.over, button, sizing_mode="stretch_width"), chart, sizing_mode="stretch_both")
 

@@ -364,7 +364,8 @@ def _cases(name: str, path: Path, rng: np.random.Generator) -> Iterator[tuple[st
         contents |= _tensors(path) if name == "weights" else {}
     if path.suffix not in (".csv", ".yml"):  # those may be cut short by their owners
         contents |= {
-            f"cut short to {length}": good[:length] for length in rng.choice(len(good), 20, replace=False).tolist()
+            f"cut short to {length}": good[:length]
+            for length in rng.choice(len(good.rstrip()), 20, replace=False).tolist()
         }
     for what, content in contents.items():
         yield what, functools.partial(path.write_bytes, content)

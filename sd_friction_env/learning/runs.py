@@ -316,7 +316,7 @@ def _filled_policy(config: Mapping[str, Any], weights: Mapping[str, Any]) -> "Ba
     for name, tensor in policy.state_dict().items():
         if name in weights and weights[name].dtype != tensor.dtype:
             raise ValueError(f"{name} in {WEIGHTS} is {weights[name].dtype}, not {tensor.dtype}")
-        if name in weights and not weights[name].isfinite().all():
+        if name in weights and weights[name].shape == tensor.shape and not weights[name].isfinite().all():
             raise ValueError(f"{name} in {WEIGHTS} has entries that are not finite")
     try:
         policy.load_state_dict(dict(weights), strict=True)

@@ -251,13 +251,14 @@ def test_damaged_folders_are_refused(copied, tmp_path):
         (copied / "config.json").write_bytes(whole["config.json"])
 
 
-@pytest.mark.parametrize("damage", ["complex", "double", "NaN", "not tensors"])
+@pytest.mark.parametrize("damage", ["complex", "double", "NaN", "huge", "not tensors"])
 def test_weights_that_are_no_finite_numbers_of_their_type_are_refused(damage, copied):
     weights = torch.load(copied / "policy.pt", weights_only=True)
     change = {
         "complex": lambda part: part.to(torch.complex64),
         "double": lambda part: part.double(),
         "NaN": lambda part: part * torch.nan,
+        "huge": lambda part: part.flatten()[:1].expand(10**14),
         "not tensors": lambda part: "x",
     }[damage]
     torch.save({name: change(part) for name, part in weights.items()}, copied / "policy.pt")

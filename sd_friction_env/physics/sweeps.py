@@ -257,14 +257,9 @@ def branch_sweep(
     A plant whose motion settles on no orbit has one row of kind "none" with the reason.
 
     Args:
-        plants: (n,) oscillators; each branch starts at the oscillator's own value of the parameter.
-        engine: where it runs.
+        plants: each branch starts at the oscillator's own value of the parameter.
         x, v, transient: of the motion, as of :func:`forced.forced_orbit`.
         over, points, doublings: as of ``orbit_branches``.
-
-    Raises:
-        TypeError, ValueError: if an argument is not of the type or in the range above, before anything is computed.
-        SweepError: see :func:`run_chunks`.
     """
     checked_count("transient", transient, 0, MOST_CYCLES)
     checked_count("doublings", doublings, 0, MOST_DOUBLINGS)

@@ -40,7 +40,7 @@ def make_run(folder, name, gain=-3.0, rows=((100, 1.0, -400.0, 0.0), (300, 3.0, 
     weights = np.zeros((size, 1))
     weights[min(1, size - 1)] = gain
     partial = runs.begin(folder / name, config | changes)
-    NetworkPolicy(((weights, np.zeros(1)),)).save(partial / runs.NETWORK)
+    NetworkPolicy(((weights, np.zeros(1)),), metadata=config | changes).save(partial / runs.NETWORK)
     (partial / runs.WEIGHTS).write_bytes(b"not read here")
     columns = zip(*rows, strict=True)
     Table(dict(zip(LEARNING, columns, strict=True))).to_csv(partial / runs.EVALUATIONS)

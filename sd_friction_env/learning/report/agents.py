@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sd_friction_env import Table
-from sd_friction_env.control.policies import Policy
+from sd_friction_env.control.policies import NetworkPolicy
 from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
 from sd_friction_env.learning import runs
 from sd_friction_env.learning.settings import ALGORITHMS, one_line
@@ -28,9 +28,8 @@ class Agent:
     task: str
     tier: str
     algorithm: str
-    title: str  # the algorithm in capitals, and what it started from if not random weights
     seed: int
-    policy: Policy
+    policy: NetworkPolicy
     evaluations: Table
 
 
@@ -57,9 +56,8 @@ def find_agents(folder: Path) -> tuple[list[Agent], list[str]]:
         stored = (environment["id"].rpartition(":")[2], environment["kwargs"], config["algorithm"], config["seed"])
         if stored != expected:
             raise runs.RunFolderError(f"{str(place)!r} must hold {expected}, as its name says; it holds {stored}")
-        title = algorithm.upper() + (f" started from {config['start_from']}" if "start_from" in config else "")
-        agents.append(Agent(place.name, task, tier, algorithm, title, int(seed), policy, _evaluations(place)))
-    return sorted(agents, key=lambda a: (TASKS.index(a.task), TIERS.index(a.tier), a.title, a.seed)), left_out
+        agents.append(Agent(place.name, task, tier, algorithm, int(seed), policy, _evaluations(place)))
+    return sorted(agents, key=lambda a: (TASKS.index(a.task), TIERS.index(a.tier), a.policy.title, a.seed)), left_out
 
 
 def _evaluations(place: Path) -> Table:
@@ -75,5 +73,5 @@ def _evaluations(place: Path) -> Table:
 
 def by_algorithm(agents: Iterable[Agent]) -> Iterator[tuple[str, list[Agent]]]:
     """Yield title and agents of each algorithm, those that started from a controller apart; agents must be in order."""
-    for title, group in itertools.groupby(agents, key=lambda agent: agent.title):
+    for title, group in itertools.groupby(agents, key=lambda agent: agent.policy.title):
         yield title, list(group)

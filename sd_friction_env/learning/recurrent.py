@@ -72,9 +72,7 @@ def train_follower(
         for _ in range(BATCHES):
             inputs, targets = kept[int(torch.randint(len(kept), ()))]
             chosen = torch.randint(EPISODES, (BATCH,))
-            estimates, truth = linear(unit(inputs[:, chosen])[0]), targets[:, chosen]
-            actions, wanted = ((slope * part[..., 0]).clamp(-1.0, 1.0) for part in (estimates, truth))
-            error = ((estimates - truth) ** 2).mean() + ((actions - wanted) ** 2).mean()
+            error = _error(linear(unit(inputs[:, chosen])[0]), targets[:, chosen], slope)
             optimiser.zero_grad()
             error.backward()
             nn.utils.clip_grad_norm_(parameters, 1.0)
@@ -82,6 +80,12 @@ def train_follower(
             errors.append(error.item())
         report(done, float(np.mean(errors)), mean_return)
     return policy()
+
+
+def _error(estimates: Tensor, truth: Tensor, slope: float) -> Tensor:
+    """Return the mean squared error of estimates (..., 2), plus that of the actions that follow from the velocities."""
+    actions, wanted = ((slope * part[..., 0]).clamp(-1.0, 1.0) for part in (estimates, truth))
+    return ((estimates - truth) ** 2).mean() + ((actions - wanted) ** 2).mean()
 
 
 def _episodes(policy: RecurrentFollower, env_id: str, seed: int, shown: float) -> tuple[Tensor, Tensor, float]:

@@ -284,3 +284,19 @@ def test_what_cannot_be_is_refused(build, message):
 def test_an_observer_needs_one_of_our_environments():
     with pytest.raises(TypeError, match="must be an SDFrictionEnv"):
         ParticleFilter.from_env(gym.make("CartPole-v1"))
+
+
+def test_look_ahead_goes_on_with_the_episodes_clock(monkeypatch):
+    env, seen, step = make(EXCITED), [], Ensemble.step
+
+    def recorded(self, states, parameters, actions, steps=0):
+        seen.append(int(np.max(steps)))
+        return step(self, states, parameters, actions, steps)
+
+    policy = ObservedRollout.from_env(env, small(ParticleFilter, env), horizon=3)
+    observation, state = env.reset(seed=0)[0], None
+    monkeypatch.setattr(Ensemble, "step", recorded)
+    for start in (True, False):
+        action, state = policy.predict(observation, state, start)
+        observation = env.step(action)[0]
+    assert seen == [0, 1, 2, 0, 1, 2, 3, 1]  # three intervals ahead, then the one that is taken

@@ -74,7 +74,7 @@ def train_follower(
             chosen = torch.randint(EPISODES, (BATCH,))
             error = _error(linear(unit(inputs[:, chosen])[0]), targets[:, chosen], slope)
             optimiser.zero_grad()
-            error.backward()
+            error.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(parameters, 1.0)
             optimiser.step()
             errors.append(error.item())

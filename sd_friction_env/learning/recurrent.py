@@ -83,7 +83,7 @@ def train_follower(
 
 
 def _error(estimates: Tensor, truth: Tensor, slope: float) -> Tensor:
-    """Return the mean squared error of estimates (..., 2), plus that of the actions that follow from the velocities."""
+    """Return the mean squared error of estimates (..., 2), and that of the actions by their velocities."""
     actions, wanted = ((slope * part[..., 0]).clamp(-1.0, 1.0) for part in (estimates, truth))
     return ((estimates - truth) ** 2).mean() + ((actions - wanted) ** 2).mean()
 

@@ -117,7 +117,9 @@ def test_training_with_a_seed_gives_the_same_network(monkeypatch):
 def test_an_error_of_the_velocity_costs_most_near_rest_where_it_is_an_action():
     rest, fast = (torch.tensor([[v, 0.0]]) for v in (0.0, 2.0))
     off = torch.tensor([[0.1, 0.0]])
-    assert recurrent._error(fast + off, fast, 3.0).item() == pytest.approx(0.1**2 / 2, rel=1e-4)  # the action is at its limit
+    assert recurrent._error(fast + off, fast, 3.0).item() == pytest.approx(
+        0.1**2 / 2, rel=1e-4
+    )  # the action is at its limit
     assert recurrent._error(rest + off, rest, 3.0).item() == pytest.approx(0.1**2 / 2 + 0.3**2, rel=1e-4)
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.stats
 from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.physics.starts import CONFIDENCE
@@ -76,9 +75,17 @@ def _middle(values: Array) -> Interval:
     return low, high
 
 
+def _trimmed_mean(values: Array) -> Array | float:
+    """Return the mean of the middle half of values along the last axis."""
+    from scipy.stats import trim_mean  # deferred: training starts without it
+
+    found: Array | float = trim_mean(values, 0.25, axis=-1)
+    return found
+
+
 def interquartile_mean(values: ArrayLike) -> float:
     """Return the mean of the middle half of all values: a quarter, rounded down, is cut at each end."""
-    return float(scipy.stats.trim_mean(np.ravel(values), 0.25))
+    return float(_trimmed_mean(np.ravel(values)))
 
 
 def run_interval(scores: Sequence[ArrayLike], *, seed: int = 0, resamples: int = RESAMPLES) -> Interval:
@@ -101,4 +108,4 @@ def run_interval(scores: Sequence[ArrayLike], *, seed: int = 0, resamples: int =
         return NO_INTERVAL
     rng = np.random.default_rng(seed)
     drawn = [task[rng.integers(task.size, size=(resamples, task.size))] for task in tasks]
-    return _middle(np.asarray(scipy.stats.trim_mean(np.concatenate(drawn, axis=1), 0.25, axis=1)))
+    return _middle(np.asarray(_trimmed_mean(np.concatenate(drawn, axis=1))))

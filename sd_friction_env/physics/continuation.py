@@ -10,7 +10,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 FloatArray = NDArray[np.float64]
 
@@ -172,6 +171,7 @@ def _located(
     before: Point,
 ) -> Point:
     """Return the zero of a test within a step; its residual includes that of the test."""
+    from scipy.optimize import brentq  # deferred: environments start without it
 
     def point(length: float) -> Point:
         return _point(problem, at(length), before.tangent, tests)

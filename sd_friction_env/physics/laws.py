@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PchipInterpolator
 
 from sd_friction_env.kernel import (
     FRICTION,
@@ -92,6 +91,8 @@ def tabulated_friction(speeds: ArrayLike, coefficients: ArrayLike) -> Tabulated:
     below = np.flatnonzero(mu < 0.0)
     if below.size:
         raise ValueError(f"coefficients must not be below 0, got {mu[below[0]].item()!r} at point {int(below[0])}")
+    from scipy.interpolate import PchipInterpolator  # deferred: environments start without it
+
     slopes = np.asarray(PchipInterpolator(w, mu).derivative()(w), np.float64)
     slopes[-1] = 0.0  # level from there on
     return Tabulated(w, mu, slopes)

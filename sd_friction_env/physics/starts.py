@@ -6,7 +6,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import scipy.stats
 from numpy.typing import NDArray
 
 from sd_friction_env.physics.parameters import STATE_LIMIT, checked_count, checked_number
@@ -51,5 +50,7 @@ def in_threads(work: Callable[[slice], None], count: int, per_thread: int, threa
 
 def share_interval(hits: int, of: int) -> tuple[float, float]:
     """Return the 95% interval of a share by Wilson's score, which (unlike a bootstrap) is not empty at 0 and 1."""
-    found = scipy.stats.binomtest(hits, of).proportion_ci(CONFIDENCE, method="wilson")
+    from scipy.stats import binomtest  # deferred: training starts without it
+
+    found = binomtest(hits, of).proportion_ci(CONFIDENCE, method="wilson")
     return float(found.low), float(found.high)

@@ -656,6 +656,17 @@ def test_importing_the_package_loads_nothing_heavy():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
+def test_an_environment_and_its_training_start_without_most_of_scipy():
+    code = (
+        "import sys, gymnasium, sd_friction_env\n"
+        "gymnasium.make('SDFriction/BeltSpeed-v0')\n"
+        "import sd_friction_env.learning.evaluation\n"
+        "heavy = {f'scipy.{part}' for part in ('optimize', 'interpolate', 'stats', 'signal', 'integrate')}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
 @pytest.mark.parametrize(
     "plant",
     [

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch._dynamo  # the first policy imports it, for a second: no part of the time of a refusal
 
 from scripts.hunting import draws
 from scripts.hunting.trials import Check, Failure

@@ -1,6 +1,6 @@
 """Controllers that act on what an observer believes: the rule, its look-ahead, and trained networks."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -10,7 +10,7 @@ from sd_friction_env.control.observers import Belief, Observer
 from sd_friction_env.control.policies import Actions, Policy, State, ThresholdFollower
 from sd_friction_env.control.policies.lookahead import pick
 from sd_friction_env.control.policies.policy import as_taken
-from sd_friction_env.physics.parameters import checked_count
+from sd_friction_env.physics.parameters import checked_count, checked_number
 
 _Floats = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class ObservedRule(ObservedPolicy):
         Raises:
             ValueError: if the actuator is not the belt's speed or has no authority.
         """
-        return cls(observer, ThresholdFollower.seeing_all(env), **named)
+        return cls(observer, **({"rule": ThresholdFollower.seeing_all(env)} | named))
 
     def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
         states, parameters = belief.mean
@@ -73,22 +73,35 @@ class ObservedRule(ObservedPolicy):
 
 @dataclass(frozen=True)
 class ObservedRollout(ObservedRule):
-    """Rollout of the rule on some of the guesses: the first action with the greatest mean return over them.
+    """Rollout of the rule on some of the guesses: of several first actions the one that gains most over the rule's own.
 
     As :class:`RolloutPolicy`, on plants and states that are believed possible; each goes on by the rule with its own
-    velocity and belt speed.
+    velocity and belt speed. The gain of an action is its mean over the guesses minus ``caution`` standard errors, so
+    that the rule's own action is kept where the guesses do not agree on a better one.
+
+    The rule's gain is 2 / belt_authority unless another rule is given. A belt that follows so makes small vibration
+    decay as fast as it would grow by itself; of all gains it moves the belt least where noise excites that vibration.
 
     Attributes:
         guesses: that are tried, in [1, 1000]: at even shares of the weights.
         candidates: evenly spaced first actions beside the rule's own, in [2, 1000].
         horizon: control intervals that are looked ahead, in [1, 10000].
+        caution: in [0, 1000].
     """
 
-    guesses: int = 12
-    candidates: int = 5
-    horizon: int = 50
+    guesses: int = 24
+    candidates: int = 7
+    horizon: int = 100
+    caution: float = 1.0
+
+    @classmethod
+    def from_env(cls, env: Any, observer: Observer, **named: Any) -> Self:
+        """Return the controller of an environment with an observer; see :meth:`ObservedRule.from_env`."""
+        rule = ThresholdFollower.seeing_all(env)
+        return super().from_env(env, observer, **({"rule": replace(rule, gain=2.0 / rule.belt_authority)} | named))
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "caution", checked_number("caution", self.caution, 0.0, 1000.0))
         for name, bounds in (("guesses", (1, 1000)), ("candidates", (2, 1000)), ("horizon", (1, 10_000))):
             object.__setattr__(self, name, checked_count(name, getattr(self, name), *bounds))
 
@@ -111,7 +124,10 @@ class ObservedRollout(ObservedRule):
             now, rewards = self.observer.ensemble.step(now, parameters, actions, steps)
             total += rewards
             actions = as_taken(self._follow(now, parameters))
-        return pick(first, np.argmax(np.nan_to_num(total, nan=-1e9).mean(axis=-2), axis=-1)), None
+        total = np.nan_to_num(total, nan=-1e9)
+        gain = total - total[..., :1]
+        error = gain.std(axis=-2) / np.sqrt(gain.shape[-2])
+        return pick(first, np.argmax(gain.mean(axis=-2) - self.caution * error, axis=-1)), None
 
 
 @dataclass(frozen=True)

@@ -401,12 +401,12 @@ class EnsembleKalmanFilter(ParticleFilter):
 
     Attributes:
         particle_steps: steps with the particle filter, in [0, 1e9].
-        inflation: factor on the particles' deviations at each reading, in [1, 2]: it keeps the filter from becoming too
-            sure of parameters that its first steps have estimated wrongly.
+        inflation: factor on the particles' deviations at each reading, in [1, 2]. 1 takes the model for exact; more
+            keeps the filter open to readings that contradict it.
     """
 
     particle_steps: int = 20
-    inflation: float = 1.002
+    inflation: float = 1.0
 
     _ranges: ClassVar = {**ParticleFilter._ranges, "inflation": (1.0, 2.0)}
     _counts: ClassVar = {**ParticleFilter._counts, "particle_steps": (0, 10**9)}

@@ -205,6 +205,8 @@ class _Supervisor(BaseCallback):
         if self.noises:  # they have just been reset
             checkpoints.restore_noises(self.model, self.noises)
         self.next_evaluation = next_multiple(self.num_timesteps, self.plan.eval_freq)
+        if self.plan.start_from is not None and not self.num_timesteps:
+            self.next_evaluation = 0  # the clone: training may make it worse
         self.next_checkpoint = next_multiple(self.num_timesteps, self.checkpoint_freq)
         self.bar = tqdm(
             total=self.plan.steps,

@@ -216,7 +216,7 @@ def test_a_belt_that_is_seen_by_its_position_alone_is_suppressed(kind, controlle
 
 
 @pytest.mark.parametrize(
-    ("env_id", "kind", "least"), [(DRIFTING, EnsembleKalmanFilter, 1.0), (EXCITED, ParticleFilter, 0.6)]
+    ("env_id", "kind", "least"), [(DRIFTING, EnsembleKalmanFilter, 0.85), (EXCITED, ParticleFilter, 0.6)]
 )
 def test_a_plant_that_drifts_or_is_excited_is_suppressed(env_id, kind, least):
     policy = ObservedRule.from_env(make(env_id), kind.from_env(make(env_id)))
@@ -300,3 +300,24 @@ def test_look_ahead_goes_on_with_the_episodes_clock(monkeypatch):
         action, state = policy.predict(observation, state, start)
         observation = env.step(action)[0]
     assert seen == [0, 1, 2, 0, 1, 2, 3, 1]  # three intervals ahead, then the one that is taken
+
+
+def test_look_ahead_leaves_the_rules_action_only_where_the_guesses_agree(monkeypatch):
+    # One interval ahead, of two guesses: an action of 1 gains 3 on one and loses 1 on the other, -1 gains 0.1 on both.
+    env = make(**BLIND)
+    gains = {1.0: np.array([3.0, -1.0]), -1.0: np.array([0.1, 0.1])}
+
+    def rewarded(self, states, parameters, actions, steps=0):
+        row = np.arange(2)[:, None]
+        return states, np.select([actions == 1.0, actions == -1.0], [gains[1.0][row], gains[-1.0][row]])
+
+    monkeypatch.setattr(Ensemble, "step", rewarded)
+    even = Belief(np.zeros((2, 3)), np.full((2, 3), 0.2), np.full(2, 0.5), np.int64(0))
+    for caution, best in ((0.0, 1.0), (0.4, 1.0), (1.0, -1.0)):
+        policy = ObservedRollout.from_env(
+            env, small(ParticleFilter, env), guesses=2, candidates=2, horizon=1, caution=caution
+        )
+        assert policy._decide(even, None, None)[0] == best
+    assert policy.rule.gain == 2.0 / env.unwrapped.task.belt_authority
+    with pytest.raises(ValueError, match=r"caution must be .* got -1"):
+        dataclasses.replace(policy, caution=-1.0)

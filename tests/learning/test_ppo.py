@@ -9,6 +9,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
+from sd_friction_env import Table
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import ConstantPolicy, ThresholdFollower
 from sd_friction_env.learning import evaluation, models, runs, training, warm_start
@@ -192,6 +193,8 @@ def test_a_run_started_from_a_controller_says_so_and_resumes_to_the_same_weights
     assert config["start_from"] == "threshold-follower"
     assert config["hyperparameters"]["warm_start"]["samples"] == 200
     assert runs.load_network(tmp_path / "whole").title == "PPO started from threshold-follower"
+    # The clone is evaluated before the first step: what a run keeps is no worse than what it starts from.
+    assert Table.from_csv(tmp_path / "whole" / "evaluations.csv")["steps"].tolist() == [0, 128, 256, 384, 512]
     assert main(["evaluate", str(tmp_path / "whole"), "--episodes", "2"]) == 0
     assert f"{tmp_path / 'whole'} (started from threshold-follower)" in capsys.readouterr().out
     calls = iter(range(1000))

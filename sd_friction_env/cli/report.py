@@ -40,6 +40,8 @@ def _report(options: argparse.Namespace) -> int:
     partial = options.quick or options.agents is not None or {*options.task} != {*TASKS} or {*options.tier} != {*TIERS}
     if options.publish and partial:
         raise UsageError("--publish keeps the whole report: leave out --quick, --agents, --task and --tier")
+    if options.publish and not options.publish.is_dir():
+        raise UsageError(f"--publish must be a folder that exists, got {str(options.publish)!r}")
     check_at_least(options, seed=0)
     out: Path = options.out
     if out.exists() and not out.is_dir():

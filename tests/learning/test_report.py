@@ -430,4 +430,6 @@ def test_the_time_to_a_score_is_that_of_the_first_evaluation_that_reaches_it(tmp
 def test_only_a_whole_report_is_published(part, tmp_path, capsys):
     assert main(["report", "--publish", str(tmp_path), "--out", str(tmp_path / "out"), *part]) == 2
     assert "--publish keeps the whole report" in capsys.readouterr().err
+    assert main(["report", "--publish", str(tmp_path / "no"), "--out", str(tmp_path / "out")]) == 2
+    assert "--publish must be a folder that exists" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -55,12 +55,7 @@ NUMBERS: dict[str, tuple[type, float, float, float, str]] = {
 
 def make_parser() -> Parser:
     """Return the parser of the command line."""
-    parser = Parser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-        prog="cleanrl_ppo.py",
-    )
+    parser = Parser(description=__doc__, prog="cleanrl_ppo.py")
     parser.add_argument("--env-id", choices=ENVIRONMENT_IDS, default="SDFriction/Force-v0", metavar="ID", help="which")
     parser.add_argument("--vector", choices=("native", "sync"), default="native", help="who steps the environments")
     parser.add_argument("--out", type=Path, metavar="FILE.npz", help="where the trained policy goes (default: nowhere)")

@@ -6,7 +6,6 @@
 Needs the extra "explore", Playwright, and a Chromium that is installed (chromium, google-chrome).
 """
 
-import argparse
 import contextlib
 import re
 import shutil
@@ -85,12 +84,7 @@ def move(page: Any, slider: str, value: float) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure; return the exit status."""
-    parser = Parser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-        prog="explorer_latency.py",
-    )
+    parser = Parser(description=__doc__, prog="explorer_latency.py")
     parser.add_argument("--moves", type=int, default=40, metavar="N", help="of each slider (default: 40)")
     options = parser.parse_args(arguments)
     if options.moves < 1:

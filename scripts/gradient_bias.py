@@ -9,7 +9,6 @@ derivative is by that action, at 0. The gradient of the mean comes from central 
 the graze, times how fast the graze moves with the action.
 """
 
-import argparse
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -116,7 +115,7 @@ def compare(case: Case, samples: int, rng: np.random.Generator) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables; return the exit status."""
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="gradient_bias.py")
+    parser = Parser(description=__doc__, prog="gradient_bias.py")
     parser.add_argument("--samples", type=int, default=20_000, metavar="N", help="starts of a case (default: 20,000)")
     options = parser.parse_args(arguments)
     if options.samples < 2:

@@ -8,7 +8,6 @@ the limit cycle from its largest x on, the other starts beside steady slip and g
 known. Guesses are up to 20% off. "inside" counts the seeds whose 95% interval holds the true value.
 """
 
-import argparse
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -190,7 +189,7 @@ PARTS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables; return the exit status."""
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="identification.py")
+    parser = Parser(description=__doc__, prog="identification.py")
     parser.add_argument("--seeds", type=int, default=20, metavar="N", help="records of each kind (default: 20)")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), help="parts to run (default: all)")
     options = parser.parse_args(arguments)

@@ -10,7 +10,6 @@ the run with the best validation episodes goes to agents/best/, with what it did
 episodes.
 """
 
-import argparse
 import dataclasses
 import json
 import shutil
@@ -107,12 +106,7 @@ def package(name: str) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train and package as the command line says; return the exit status."""
-    parser = Parser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-        prog="pretrain.py",
-    )
+    parser = Parser(description=__doc__, prog="pretrain.py")
     parser.add_argument(
         "--only", nargs="+", choices=NAMES, default=NAMES, metavar="NAME", help=f"of {', '.join(NAMES)}"
     )

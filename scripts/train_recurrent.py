@@ -7,7 +7,6 @@ python scripts/train_recurrent.py --tier blind --seed 0 1 2 3 4
 python scripts/train_recurrent.py --tier blind --rounds 10 --out .
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +26,7 @@ from sd_friction_env.learning.versions import versions
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train as the command line says; return the exit status."""
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__)
     parser.add_argument("--tier", nargs="+", choices=OPEN_TIERS, default=list(OPEN_TIERS), help="default: all")
     parser.add_argument("--seed", type=int, nargs="+", default=[0], help="default: 0")
     parser.add_argument("--rounds", type=int, default=100, help="of 256 episodes and a fit (default: 100)")

@@ -1,8 +1,7 @@
 """Print each accuracy target of the project next to the measured value.
 
     python scripts/verify.py                        published values, closed forms, other laws, energy (seconds)
-    python scripts/verify.py --also speed environment transients windows        (a minute or two)
-    python scripts/verify.py --also basins          a million starts, twice (half a minute)
+    python scripts/verify.py --also windows         where the left well holds attractors (a minute)
     python scripts/verify.py --also curves          960 points of curves against SciPy (ten minutes)
     python scripts/verify.py --also oracle          random oscillators against SciPy (ten minutes)
 
@@ -11,19 +10,14 @@ Exit status 1 if a number misses its bound.
 
 import argparse
 import math
-import statistics
-import time
 from collections.abc import Callable
 
 import numpy as np
 
-from scripts.benchmark.with_scipy import transient
 from scripts.figures import paper
 from scripts.figures.common import PANELS
 from sd_friction_env import (
     OscillatorParameters,
-    SDFrictionEnv,
-    amplitude_curve,
     attractors,
     critical_belt_speeds,
     equilibria,
@@ -32,7 +26,6 @@ from sd_friction_env import (
     simulate,
 )
 from sd_friction_env.physics import theory
-from sd_friction_env.physics.basins import basins
 from sd_friction_env.physics.orbits import rest_place
 
 EXACT = OscillatorParameters()
@@ -275,69 +268,6 @@ def against_oracle(report: Report, draws: int = 100) -> None:
     report.below(f"worst gap ({amplified} that amplify set apart)", worst, 1e-6)
 
 
-def timed(work: Callable[[], object], repeats: int = 3) -> float:
-    """Return the median time of some runs, in seconds."""
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - begin)
-    return statistics.median(times)
-
-
-def speed(report: Report) -> None:
-    """Figs. 3 to 5 in all, and one curve against transients integrated with SciPy's solve_ivp."""
-    report.head("Speed, on one core with a warm cache, seconds")
-
-    def figures() -> None:
-        for compute in (paper.compute_3, paper.compute_4, paper.compute_5):
-            compute()
-
-    points = sum(compute().n_rows for compute in (paper.compute_3, paper.compute_4, paper.compute_5))
-    report.below(f"all {points} points of Figs. 3 to 5", timed(figures), 1.0)
-
-    speeds = np.linspace(0.02, 0.6, 30)
-    ours = timed(lambda: amplitude_curve(EXACT, speeds))
-    begin = time.perf_counter()
-    shown = speeds[:: len(speeds) // 3]
-    for belt in shown.tolist():
-        transient(EXACT.replace(belt_speed=belt), 400.0)
-    theirs = (time.perf_counter() - begin) * len(speeds) / len(shown)
-    print(f"{len(speeds)} belt speeds: {ours:.4f} s; SciPy, transients of 400: {theirs:.1f} s ({len(shown)} timed)")
-    ratio = theirs / ours
-    report.missed += ratio < 1000.0
-    print(f"ratio {ratio:.0f}, wanted at least 1000{'' if ratio >= 1000.0 else '   MISSED'}")
-
-
-def slow_transients(report: Report) -> None:
-    """The end of oscillation where transients last longest: (mu_s - mu_m)/v_m = 0.085."""
-    report.head(
-        "(mu_s - mu_m)/v_m = 0.085, cubic: the end of oscillation, and what a run of 600 time units still shows"
-    )
-    p = paper.plant("cubic", 0.085)
-    v_b1 = critical_belt_speeds(p).v_b1
-    report.row("v_b1", 0.1088, v_b1, 5.1e-5)
-    for belt in (0.15, 0.2, 0.25):
-        history = simulate(p.replace(belt_speed=belt), t_end=600.0, dt=0.05)
-        kind = limit_cycle(p.replace(belt_speed=belt)).kind
-        print(f"    v_b = {belt}: amplitude {history.amplitude(since=590.0):.4f} still; in the end: {kind}")
-
-
-def environment(report: Report) -> None:
-    """The environment under zero action against the orbit solver."""
-    report.head("Passive environment against orbit solver: worst gap in amplitude, away from v_b1")
-    for geometry in PANELS:
-        worst = 0.0
-        for belt in np.linspace(0.02, 0.42, 21).tolist():
-            cycle = limit_cycle(EXACT.replace(geometry=geometry, belt_speed=belt))
-            env = SDFrictionEnv({"geometry": geometry, "belt_speed": belt}, episode_steps=10**6)
-            env.reset(options={"phase": 0.25})
-            infos = [env.step(np.zeros(1, np.float32))[4] for _ in range(300)]
-            size = 0.5 * (max(i["x_max"] for i in infos) - min(i["x_min"] for i in infos))
-            worst = max(worst, abs(size - cycle.amplitude))
-        report.below(f"{geometry}: 21 belt speeds from 0.02 to 0.42", worst, 1e-6)
-
-
 def windows(_: Report) -> None:
     """Print where, in belt speed up to 0.6, the left well holds an attractor, and of which kind."""
     print("\nLeft-well attractors for belt speeds from 0.005 to 0.6 (ends found by bisection)")
@@ -393,33 +323,12 @@ def curves(report: Report) -> None:
         report.below(f"{name}: v_b1", abs(v_b1 / oracle.hopf(plant) - 1.0), 1e-7)
 
 
-def million_starts(report: Report) -> None:
-    """Classify a million starts in two hard cases."""
-    report.head("1,000,000 starts, x in [-1.5, 1.5], v in [-1, 1], seconds")
-    for alpha, belt in ((0.2, 0.2), (0.5, 0.43)):
-        p = EXACT.replace(alpha=alpha, belt_speed=belt)
-        rng = np.random.default_rng(0)
-        x, v = rng.uniform(-1.5, 1.5, 1_000_000), rng.uniform(-1.0, 1.0, 1_000_000)
-        basins(p, x[:10], v[:10])
-        begin = time.perf_counter()
-        found = basins(p, x, v)
-        report.below(f"exact alpha {alpha}, v_b {belt}", time.perf_counter() - begin, 30.0)
-        for label, cycle in enumerate(found.attractors):
-            share, error = found.fraction(label)
-            print(f"    {cycle.kind} about {0.5 * (cycle.x_max + cycle.x_min):.4f}: {share:.4f} +- {error:.4f}")
-        print(f"    lost contact {found.fraction(-1)[0]}, undecided {found.fraction(-2)[0]}")
-
-
 SECTIONS: dict[str, Callable[[Report], None]] = {
     "published": published,
     "linear": linear_belt,
     "laws": other_laws,
     "energy": energy,
-    "speed": speed,
-    "transients": slow_transients,
-    "environment": environment,
     "windows": windows,
-    "basins": million_starts,
     "curves": curves,
     "oracle": against_oracle,
 }

@@ -29,8 +29,9 @@ import sd_friction_env
 from scripts.benchmark import arithmetic, batches, drawing, peers, sb3, startup, with_scipy
 from scripts.benchmark.batches import FORCE, our_label
 from scripts.benchmark.measuring import Bench, Numbers, Rows, Target, best_ratio
+from sd_friction_env.cli.options import check_file
 from sd_friction_env.pictures import plotting
-from sd_friction_env.storage import atomic_file, checked_ending
+from sd_friction_env.storage import atomic_file
 
 ROOT = Path(__file__).resolve().parents[2]
 BUSY = 0.5
@@ -161,16 +162,9 @@ def _parsed(arguments: list[str] | None) -> argparse.Namespace:
         value = getattr(options, name)
         if value is not None and value < 1:
             parser.error(f"--{name} must be a whole number of at least 1, got {value}")
-    for name in ("out", "plot"):
-        path = getattr(options, name)
-        if path is not None and not path.parent.is_dir():
-            parser.error(f"--{name} {str(path)!r} lies in no existing folder")
-        if path is not None and path.is_dir():
-            parser.error(f"--{name} {str(path)!r} is a folder; a file is wanted")
     try:
-        for name, endings in (("out", (".json",)), ("plot", plotting.FORMATS)):
-            if getattr(options, name) is not None:
-                checked_ending(getattr(options, name), endings, f"--{name}")
+        check_file("--out", options.out, ".json")
+        check_file("--plot", options.plot, *plotting.FORMATS)
     except ValueError as error:
         parser.error(str(error))
     if options.peers is None:

@@ -79,35 +79,6 @@ class WithSciPy:
                 just_slipped = False
 
 
-def transient(p: OscillatorParameters, t_end: float) -> float:
-    """Return the amplitude over the last eighth of a run: slip by solve_ivp with an event, stick in steps of 0.002."""
-    t, x, v, mode = 0.0, 0.0, p.belt_speed, 0
-    belt = p.belt_speed
-    low, high = math.inf, -math.inf
-    while t < t_end:
-        if mode == 0:
-            while abs(2.0 * p.beta * belt + p.restoring_force(x)) <= p.mu_s * p.normal_force(x) and t < t_end:
-                t, x = t + 2e-3, x + 2e-3 * belt
-            mode = -1
-            continue
-
-        def slip(_: float, y: np.ndarray) -> list[float]:
-            w = y[1] - belt
-            friction = (-p.mu_s - p.k1 * w + p.k3 * w**3) * p.normal_force(y[0])
-            return [y[1], -2.0 * p.beta * y[1] - p.restoring_force(y[0]) - friction]
-
-        def sticks(s: float, y: np.ndarray) -> float:
-            return float(y[1] - belt) if s > 1e-3 else -1.0
-
-        sticks.terminal, sticks.direction = True, 1  # type: ignore[attr-defined]
-        run = solve_ivp(slip, (0.0, t_end - t), [x, v], events=sticks, rtol=1e-9, atol=1e-11)
-        late = run.y[0][t + run.t > 0.875 * t_end]
-        if late.size:
-            low, high = min(low, late.min()), max(high, late.max())
-        t, x, v, mode = t + float(run.t[-1]), float(run.y[0, -1]), belt, 0
-    return 0.5 * (high - low)
-
-
 def with_scipy(bench: Bench) -> None:
     """The same control interval by scipy.integrate.solve_ivp, called once per step."""
     calls = bench.length(500, 150)

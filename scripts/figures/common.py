@@ -1,8 +1,8 @@
-"""What the figures share: the two geometries, the table's header, and how tables are cut and joined."""
+"""What the figures share: the two geometries, the table's header, and how tables are cut."""
 
 import functools
 import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +36,3 @@ def select(table: Table, **values: Any) -> Table:
     for name, value in values.items():
         chosen &= table[name] == value
     return Table({name: column[chosen] for name, column in table.items()}, table.metadata)
-
-
-def stack(tables: Iterable[Mapping[str, Any]], header: Mapping[str, str]) -> Table:
-    """Return tables of the same columns one below the other."""
-    parts = list(tables)
-    return Table({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, header)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scripts.figures.common import metadata, select, stack
+from scripts.figures.common import metadata, select
 from sd_friction_env import OscillatorParameters, Table, limit_cycle
 from sd_friction_env.learning.optimal import TASKS, OptimalPolicy, Problem
 from sd_friction_env.pictures import plotting
@@ -45,7 +45,7 @@ def compute() -> Table:
             columns = dict(zip(("x", "v", "v_belt", "action"), np.array(rows).T, strict=True))
             labels = {"task": np.full(len(rows), task), "motion": np.full(len(rows), motion)}
             parts.append({**labels, "t": policy.task.control_interval * np.arange(len(rows)), **columns})
-    return stack(parts, metadata([plant]))
+    return Table.stacked(parts, metadata([plant]))
 
 
 def on_plane(policy: OptimalPolicy) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scripts.figures.common import PANELS, metadata, select, stack
+from scripts.figures.common import PANELS, metadata, select
 from sd_friction_env import OscillatorParameters, Table, limit_cycle, simulate
 from sd_friction_env.physics import theory
 from sd_friction_env.physics.curves import refined_curve
@@ -56,14 +56,14 @@ def plant(geometry: str, ratio: float) -> OscillatorParameters:
     return nominal.replace(geometry=geometry, mu_m=nominal.mu_s - ratio * nominal.v_m)
 
 
-def curve(parameters: OscillatorParameters, end: float, **labels: Any) -> dict[str, Any]:
+def curve(parameters: OscillatorParameters, end: float, **labels: Any) -> Table:
     """Return the amplitude curve up to a belt speed, every 0.005, with labels as columns.
 
     The mass starts at the spring's right-hand place of rest: alpha < 1 has two wells, and from x = 0, between them, the
     cubic oscillator with alpha = 0.2 loses contact at the highest belt speeds.
     """
     found = refined_curve(parameters, np.linspace(0.0, end, round(200 * end) + 1), x=rest_place(parameters), v=0.0)
-    return {name: np.full(found.n_rows, value) for name, value in labels.items()} | dict(found)
+    return found.labelled(**labels)
 
 
 def compute_2() -> Table:
@@ -74,28 +74,27 @@ def compute_2() -> Table:
             cycle = limit_cycle(OscillatorParameters(geometry=geometry, belt_speed=speed))
             start = cycle.parameters, cycle.x_phase0, cycle.v_phase0
             history = simulate(*start, cycle.period, dt=cycle.period / SAMPLES).to_table()
-            labels = {"geometry": geometry, "belt_speed": speed, "kind": cycle.kind}
-            parts.append({name: np.full(history.n_rows, value) for name, value in labels.items()} | dict(history))
-    return stack(parts, metadata(OscillatorParameters(geometry=geometry) for geometry in PANELS))
+            parts.append(history.labelled(geometry=geometry, belt_speed=speed, kind=cycle.kind))
+    return Table.stacked(parts, metadata(OscillatorParameters(geometry=geometry) for geometry in PANELS))
 
 
 def compute_3() -> Table:
     """Return the curve of each geometry."""
     plants = [OscillatorParameters(geometry=geometry) for geometry in PANELS]
-    return stack((curve(p, 0.6, geometry=p.geometry) for p in plants), metadata(plants))
+    return Table.stacked((curve(p, 0.6, geometry=p.geometry) for p in plants), metadata(plants))
 
 
 def compute_4() -> Table:
     """Return the curve of each geometry and alpha, of the right-hand well."""
     plants = [OscillatorParameters(geometry=geometry, alpha=alpha) for geometry in PANELS for alpha in ALPHAS]
-    return stack((curve(p, 0.6, geometry=p.geometry, alpha=p.alpha) for p in plants), metadata(plants))
+    return Table.stacked((curve(p, 0.6, geometry=p.geometry, alpha=p.alpha) for p in plants), metadata(plants))
 
 
 def compute_5() -> Table:
     """Return the curve of each geometry and ratio."""
     plants = {(geometry, ratio): plant(geometry, ratio) for geometry in PANELS for ratio in RATIOS}
     curves = (curve(p, 0.45, geometry=geometry, ratio=ratio) for (geometry, ratio), p in plants.items())
-    return stack(curves, metadata(plants.values()))
+    return Table.stacked(curves, metadata(plants.values()))
 
 
 def compute_linear() -> Table:
@@ -106,7 +105,7 @@ def compute_linear() -> Table:
     upper = found["x_max"] - theory.steady_friction(speeds, p.mu_s, p.k1, p.k3) * p.g1
     first = np.where(speeds < v_b1, theory.pure_slip_amplitude(np.minimum(speeds, v_b1), v_b1), np.nan)
     closed = {"upper": upper, "closed_upper": theory.stick_slip_upper_amplitude(speeds, p.beta, p.k1, p.k3, p.g1)}
-    return Table(found | closed | {"closed_pure_slip": first}, metadata([p]))
+    return Table(dict(found) | closed | {"closed_pure_slip": first}, metadata([p]))
 
 
 @plotting.house_style()

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scripts.figures.common import metadata, select, stack
+from scripts.figures.common import metadata, select
 from scripts.figures.control import PHASE, VELOCITIES
 from sd_friction_env import OscillatorParameters, Table
 from sd_friction_env.control.policies import ThresholdFollower
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning.optimal import TASKS, OptimalPolicy, Problem
-from sd_friction_env.learning.optimal.problem import make_bare_env
 from sd_friction_env.pictures import plotting
 
 STEPS = 200  # control intervals drawn
@@ -26,7 +26,7 @@ class Rule:
     """The rule as a function of states."""
 
     def __init__(self) -> None:
-        self.env = make_bare_env(ENV_ID)
+        self.env = make_env(ENV_ID)
         self.follower = ThresholdFollower.from_env(self.env)
         self.line = self.follower.threshold * (1.0 - self.env.task.belt_authority) * self.env.nominal.belt_speed
 
@@ -46,7 +46,7 @@ def controllers() -> dict[str, OptimalPolicy | Rule]:
 def compute() -> Table:
     """Return both motions from one state of the passive cycle: t, x, v, v_belt and the action taken."""
     plant = OscillatorParameters()
-    task = make_bare_env(ENV_ID).task
+    task = make_env(ENV_ID).task
     start = np.array([[*task.cycle_state(plant, PHASE), plant.belt_speed]])
     problem = Problem(ENV_ID, task, (plant,), start, ((),))
     parts = []
@@ -58,7 +58,7 @@ def compute() -> Table:
             states, _ = problem.step(states, action)
         columns = dict(zip(("x", "v", "v_belt", "action"), np.array(rows).T, strict=True))
         parts.append({"controller": np.full(STEPS, name), "t": task.control_interval * np.arange(STEPS), **columns})
-    return stack(parts, metadata([plant]))
+    return Table.stacked(parts, metadata([plant]))
 
 
 @plotting.house_style()

@@ -140,14 +140,14 @@ def legal_trial(seed: int, index: int) -> None:
 
 
 _COMMANDS = {
-    "curve": "--geometry --alpha --belt-speed --start --mu-s --json --workers --backend",
+    "amplitude": "--geometry --alpha --belt-speed --start --mu-s --json --workers --backend",
     "cycle": "--geometry --alpha --belt-speed --start --attractors --mu-m --v-m",
     "critical": "--geometry --alpha --mu-s --mu-m --v-m --beta",
     "simulate": "--start --t-end --dt --force --friction --force-amplitude --force-frequency",
     "basins": "--x --v --shape --alpha --belt-speed --plot --out",
     "poincare": "--cycles --transient --force-amplitude --force-frequency --ripple-amplitude",
     "lyapunov": "--cycles --transient --force-amplitude --stiffness-amplitude",
-    "bifurcation": "--parameter --direction --cycles --transient --force-amplitude",
+    "bifurcation": "--over --direction --cycles --transient --force-amplitude",
     "doctor": "--json",
     "hyperparameters": "--show",
     "video": "--task --tier --steps --every --fps --out --seed",

@@ -30,7 +30,6 @@ from sd_friction_env.cli.options import (
     progress_bar,
     stacked,
     start_of,
-    with_columns,
 )
 from sd_friction_env.physics import sweeps
 from sd_friction_env.physics.basins import basin_grid
@@ -63,14 +62,11 @@ def _amplitude(options: argparse.Namespace) -> int:
     curves = sweeps.amplitude_sweep(
         [parameters for _, parameters in grid], speeds, engine_of(options), x=x, v=v, all_attractors=options.attractors
     )
-    table = stacked(
-        (with_columns(curve, swept) for curve, (swept, _) in zip(curves, grid, strict=True)), metadata_of(options)
-    )
+    table = stacked(options, curves, grid)
     emit(options, table)
     if options.plot is not None:
         if not options.attractors:  # lines, which want the points at which they end
-            refined = (with_columns(refined_curve(plant, speeds, x=x, v=v), swept) for swept, plant in grid)
-            table = stacked(refined, {})
+            table = stacked(options, (refined_curve(plant, speeds, x=x, v=v) for _, plant in grid), grid)
         plotting.save_figure(plotting.draw_amplitude_table(table, [swept for swept, _ in grid]), options.plot)
     return 0
 
@@ -208,8 +204,7 @@ def _integrity(options: argparse.Namespace) -> int:
         limit=options.limit,
         seed=options.seed,
     )
-    parts = (with_columns(table, swept) for table, (swept, _) in zip(tables, grid, strict=True))
-    emit(options, stacked(parts, metadata_of(options)))
+    emit(options, stacked(options, tables, grid))
     return 0
 
 
@@ -250,9 +245,9 @@ def _over(
         raise UsageError(f"--over and --{options.over[0]} are one parameter: give it once")
     arguments |= {"direction": options.direction, "cycles": options.cycles, "transient": options.transient}
     tables = sweep([parameters for _, parameters in grid], name, values, engine_of(options), **arguments)
-    parts = (with_columns(part, swept) for part, (swept, _) in zip(tables, grid, strict=True))
-    named = ({name if column == "value" else column: data for column, data in part.items()} for part in parts)
-    emit(options, stacked(named, metadata_of(options)))
+    table = stacked(options, tables, grid)
+    named = {name if column == "value" else column: data for column, data in table.items()}
+    emit(options, Table(named, table.metadata))
     _plot(options, 7.0, 4.4, draw, tables[0])
     return 0
 
@@ -265,8 +260,7 @@ def _branches(options: argparse.Namespace) -> int:
     how: dict[str, Any] = {"points": options.points, "doublings": options.doubled, "transient": options.transient}
     plants = [parameters for _, parameters in grid]
     tables = sweeps.branch_sweep(plants, (name, low, high), engine_of(options), x=x, v=v, **how)
-    parts = (with_columns(part, swept) for part, (swept, _) in zip(tables, grid, strict=True))
-    emit(options, stacked(parts, metadata_of(options)))
+    emit(options, stacked(options, tables, grid))
     if options.plot is not None:
         values = [value for value in np.linspace(low, high, 201).tolist() if _is_valid(plants[0], name, value)]
         brute_force = bifurcation_diagram(plants[0], name, values, direction="both", cycles=60, x=x, v=v)

@@ -138,7 +138,7 @@ def _evaluate(options: argparse.Namespace) -> int:
                 table = evaluation.evaluate(policy, env_id, seeds, env_kwargs, passive=passive, options=plants)
                 row = evaluation.summarise(name, table, passive_table, optimal)
                 rows.append(row | {"ms": evaluation.decision_milliseconds(policy, env_id, env_kwargs)})
-                all_episodes.append((env_id, name, table))
+                all_episodes.append(table.labelled(env_id=env_id, controller=name))
             if optimal is not None:
                 rows.append({"controller": "optimum", "return": float(np.nanmean(optimal)), "score": 1.0})
             shown = f" with {kwargs_text}" if env_kwargs else ""
@@ -152,13 +152,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     if options.csv is not None:
         Table.from_rows(all_rows, about).to_csv(options.csv)
     if options.episodes_csv is not None:
-        columns: dict[str, Any] = {
-            "env_id": [env_id for env_id, _, table in all_episodes for _ in range(table.n_rows)],
-            "controller": [name for _, name, table in all_episodes for _ in range(table.n_rows)],
-        }
-        for name in all_episodes[0][2]:
-            columns[name] = np.concatenate([table[name] for _, _, table in all_episodes])
-        Table(columns, about).to_csv(options.episodes_csv)
+        Table.stacked(all_episodes, about).to_csv(options.episodes_csv)
     return 0
 
 

@@ -56,6 +56,7 @@ def parser(names: Sequence[str] = tuple(_COMMANDS)) -> argparse.ArgumentParser:
     """Return the parser of the program, with the options of these commands; the others are listed only."""
     program = _Parser(
         prog="sd-friction",
+        formatter_class=argparse.HelpFormatter,
         description="The self-excited SD oscillator on a moving belt: passive analysis, control, pictures.",
         epilog="each command has its own help with examples: sd-friction amplitude --help",
     )
@@ -73,7 +74,6 @@ def parser(names: Sequence[str] = tuple(_COMMANDS)) -> argparse.ArgumentParser:
                 help=summary,
                 description=f"{summary[0].upper()}{summary[1:]}.\n\n{command.text}".strip(),
                 epilog=f"examples:\n{lines}",
-                formatter_class=argparse.RawDescriptionHelpFormatter,
             )
         )
     return program

@@ -10,7 +10,7 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple, NoReturn
@@ -60,10 +60,11 @@ class Command(NamedTuple):
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line."""
+    """An argument parser whose errors are one line, and whose help keeps the lines of its description."""
 
     def __init__(self, **arguments: Any) -> None:
-        super().__init__(**{"allow_abbrev": False, **arguments})
+        formatter = argparse.RawDescriptionHelpFormatter
+        super().__init__(**{"allow_abbrev": False, "formatter_class": formatter, **arguments})
         # What argparse takes for a value and not for an option: ranges that begin below zero, too.
         self._negative_number_matcher = re.compile(r"^-[\d.]")
 
@@ -145,10 +146,12 @@ def check_file(option: str, path: Path | None, *endings: str) -> None:
     """Check that a file could be written: its ending and its folder."""
     if path is None:
         return
+    if not path.parent.is_dir():
+        raise UsageError(f"{option} {str(path)!r} lies in no existing folder: make {str(path.parent)!r} first")
+    if path.is_dir():
+        raise UsageError(f"{option} {str(path)!r} is a folder; a file is wanted")
     if endings:
         checked_ending(path, endings, option)
-    if path.is_dir() or not path.absolute().parent.is_dir():
-        raise UsageError(f"{option} must be a file in a folder that exists, got {str(path)!r}")
 
 
 @contextlib.contextmanager
@@ -293,14 +296,7 @@ def add_output(
 def check_output(options: argparse.Namespace) -> None:
     """Refuse names that could not be written at the end of a long computation."""
     for name, endings in (("out", getattr(options, "out_endings", (".csv", ".json"))), ("plot", plotting.FORMATS)):
-        path = getattr(options, name, None)
-        if path is None:
-            continue
-        checked_ending(path, endings, f"--{name}")
-        if not path.parent.is_dir():
-            raise UsageError(f"--{name} {str(path)!r} lies in no existing folder: make {str(path.parent)!r} first")
-        if path.is_dir():
-            raise UsageError(f"--{name} {str(path)!r} is a folder")
+        check_file(f"--{name}", getattr(options, name, None), *endings)
     if getattr(options, "plot", None) is not None:
         plotting.new_figure(1.0, 1.0, 1, 1)  # says what to install if matplotlib is missing
 
@@ -356,10 +352,9 @@ def progress_bar(total: int, unit: str) -> Callable[[int], None]:
     return show
 
 
-def with_columns(table: Table, columns: dict[str, Any]) -> dict[str, Any]:
-    return {name: np.full(table.n_rows, value) for name, value in columns.items()} | dict(table)
-
-
-def stacked(tables: Iterator[dict[str, Any]], metadata: dict[str, Any]) -> Table:
-    parts = list(tables)
-    return Table({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, metadata)
+def stacked(
+    options: argparse.Namespace, tables: Iterable[Table], grid: Sequence[tuple[dict[str, Any], OscillatorParameters]]
+) -> Table:
+    """Return the tables of a grid's oscillators one below the other, after the parameters that were swept."""
+    parts = (table.labelled(**swept) for table, (swept, _) in zip(tables, grid, strict=True))
+    return Table.stacked(parts, metadata_of(options))

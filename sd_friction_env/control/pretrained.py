@@ -2,16 +2,18 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from sd_friction_env.control.policies.network import NetworkPolicy, PolicyFileError, load_policy
 from sd_friction_env.control.policies.recurrent import RecurrentFollower
-from sd_friction_env.environments.single import SDFrictionEnv
+from sd_friction_env.environments.ids import bare_id
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.storage import AGENTS
 
 PRETRAINED = AGENTS / "best"
@@ -21,11 +23,6 @@ _GOLDEN_STEPS = 60
 # Rounding on other builds may change the last digit of an observation in single precision (2e-7); a friction
 # coefficient changed by 0.1% moves observations by 3e-4.
 _GOLDEN_TOLERANCE = 1e-6
-
-
-def bare_id(env_id: str) -> str:
-    """Return an environment's id without the module name before the colon."""
-    return env_id.rpartition(":")[2]
 
 
 def pretrained_file(env_id: str) -> Path:
@@ -60,8 +57,7 @@ def fingerprint(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> dic
     ``configuration``: spaces, task and nominal plant; ``golden``: observations and rewards of an episode with a fixed
     seed and fixed actions that slips, sticks and breaks away.
     """
-    env = gym.make(env_id, **dict(env_kwargs or {})).unwrapped
-    assert isinstance(env, SDFrictionEnv)
+    env = make_env(env_id, env_kwargs)
     configuration = {
         "observation": _described(env.observation_space),
         "action": _described(env.action_space),
@@ -70,13 +66,19 @@ def fingerprint(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> dic
     }
     observation, _ = env.reset(seed=0)
     golden = [[*observation.tolist(), 0.0]]
-    for t in range(_GOLDEN_STEPS):
-        action = np.array([(7 * (t // 3) % 11) / 5.0 - 1.0], np.float32)
+    for action in golden_actions():
         observation, reward, terminated, _, _ = env.step(action)
         golden.append([*observation.tolist(), float(reward)])
         if terminated:
             break
     return {"configuration": json.loads(json.dumps(configuration)), "golden": golden[::5]}
+
+
+def golden_actions() -> Iterator[NDArray[np.float32]]:
+    """Yield the actions of golden episodes: each lasts three intervals, so that the mass crosses, sticks and breaks
+    away with both actuators."""
+    for t in range(_GOLDEN_STEPS):
+        yield np.array([(7 * (t // 3) % 11) / 5.0 - 1.0], np.float32)
 
 
 def _described(space: gym.Space[Any]) -> dict[str, Any]:
@@ -89,6 +91,14 @@ def changes_since(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
 
     Parts that the stored one lacks are differences, too.
     """
+    changed = configuration_changes(stored, now)
+    if not close(stored.get("golden", []), now["golden"], _GOLDEN_TOLERANCE):
+        changed.append("the dynamics, the observation or the reward")
+    return changed
+
+
+def configuration_changes(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return descriptions of the differences between the configurations of two fingerprints."""
     changed = []
     configuration = stored.get("configuration")
     parts = configuration if isinstance(configuration, Mapping) else {}
@@ -100,10 +110,7 @@ def changes_since(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
         # New arguments are left out: the golden episode shows whether their defaults change anything.
         names = sorted(name for name in values if values[name] != present.get(name))
         changed += [f"{part} {name}: {values[name]!r} -> {present.get(name)!r}" for name in names]
-    changed += [f"{part}: unknown" for part in sorted(set(parts) - set(now["configuration"]))]
-    if not close(stored.get("golden", []), now["golden"], _GOLDEN_TOLERANCE):
-        changed.append("the dynamics, the observation or the reward")
-    return changed
+    return changed + [f"{part}: unknown" for part in sorted(set(parts) - set(now["configuration"]))]
 
 
 def close(stored: Any, now: Any, tolerance: float) -> bool:

@@ -44,6 +44,11 @@ def environment_id(task: str, tier: str = "nominal") -> str:
     return f"SDFriction/{_TASKS[task][0]}{tiers[tier][0]}-v0"
 
 
+def bare_id(env_id: str) -> str:
+    """Return an environment's id without the module name before the colon."""
+    return env_id.rpartition(":")[2]
+
+
 def _tiers_of(task: str) -> dict[str, tuple[str, dict[str, Any]]]:
     return _TIERS | (_OPEN_TIERS if task == "belt" else {})
 

@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from sd_friction_env.environments.batch import SDFrictionVectorEnv
+from sd_friction_env.environments.ids import bare_id
 from sd_friction_env.environments.info import PLAIN_STATISTICS, RESET_KEYS, checked_info_keys
 from sd_friction_env.extras import extra
 
@@ -68,7 +69,7 @@ class SDFrictionVecEnv(VecEnv):
             kwargs["info_keys"] = keys
         if not isinstance(env_id, str):
             raise TypeError(f"env_id must name an environment of this package, got {env_id!r}")
-        name = env_id.rpartition(":")[2]
+        name = bare_id(env_id)
         if name not in gym.registry or gym.registry[name].vector_entry_point != _ENTRY_POINT:
             raise ValueError(f"env_id must name an environment of this package, got {env_id!r}")
         envs = gym.make_vec(env_id, num_envs=num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs).unwrapped

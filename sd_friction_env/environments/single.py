@@ -365,3 +365,11 @@ class SDFrictionEnv(LengthInSpec, gym.Env[NDArray[np.float32], NDArray[np.float3
         """Close the window, if there is one."""
         if self._display is not None:
             self._display.close()
+
+
+def make_env(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> SDFrictionEnv:
+    """Return a bare environment (without wrappers, which cost more time than the step)."""
+    env = gym.make(env_id, **dict(env_kwargs or {})).unwrapped
+    if not isinstance(env, SDFrictionEnv):
+        raise TypeError(f"env_id must name an environment of sd_friction_env, got {env_id!r}")
+    return env

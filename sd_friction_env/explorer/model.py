@@ -16,7 +16,6 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,11 +29,12 @@ from sd_friction_env.control.policies import (
 )
 from sd_friction_env.control.pretrained import load_pretrained
 from sd_friction_env.environments.ids import environment_id
-from sd_friction_env.environments.single import SDFrictionEnv
+from sd_friction_env.environments.single import SDFrictionEnv, make_env
+from sd_friction_env.environments.task import passive_motion
 from sd_friction_env.physics.basins import basin_grid
 from sd_friction_env.physics.charts import filled_regions, stability_chart
 from sd_friction_env.physics.curves import amplitude_curve
-from sd_friction_env.physics.orbits import LimitCycle, OrbitError, limit_cycle
+from sd_friction_env.physics.orbits import LimitCycle
 from sd_friction_env.physics.parameters import STATE_LIMIT, Kind, OscillatorParameters
 from sd_friction_env.pictures.plotting import BLACK, BLUE, GREEN, GREY, REGIONS, VERMILION
 
@@ -144,18 +144,16 @@ class Live:
         self.restart()
 
     def _loop(self, controller: str) -> Loop:
-        env = gym.make(self.env_id, episode_steps=_LONGEST).unwrapped
-        assert isinstance(env, SDFrictionEnv)
-        return Loop(env, self._policy(controller))
+        return Loop(make_env(self.env_id, {"episode_steps": _LONGEST}), self._policy(controller))
 
     def _policy(self, controller: str) -> Policy:
         """Return a controller by its name; one that is not available does nothing, and ``missing`` says why."""
         self.missing.pop(controller, None)
         try:
             if controller == FEEDBACK:
-                return VelocityFeedback.from_env(gym.make(self.env_id), _GAIN)
+                return VelocityFeedback.from_env(make_env(self.env_id), _GAIN)
             if controller == FOLLOWER:
-                return EstimatingFollower.from_env(gym.make(self.env_id), waits=True)
+                return EstimatingFollower.from_env(make_env(self.env_id), waits=True)
             if controller == AGENT:
                 return load_pretrained(self.env_id)
             if controller == ROBUST:
@@ -274,14 +272,6 @@ class Live:
 # The plant's curves ---------------------------------------------------------------------------------------------------
 
 
-def passive_cycle(parameters: OscillatorParameters) -> LimitCycle | None:
-    """Return the passive limit cycle, without excitation; None if there is none that can be named."""
-    try:
-        return limit_cycle(parameters.unexcited)
-    except OrbitError:
-        return None
-
-
 def passive_curve(
     parameters: OscillatorParameters, speeds: NDArray[np.float64] = _CURVE_SPEEDS
 ) -> dict[str, NDArray[np.float64]]:
@@ -358,7 +348,7 @@ class PlantPicture:
     def of(cls, parameters: OscillatorParameters) -> "PlantPicture":
         """Compute it, and load the code that steps such a plant."""
         _load_steps(parameters.kind)
-        return cls(parameters, passive_curve(parameters), passive_cycle(parameters))
+        return cls(parameters, passive_curve(parameters), passive_motion(parameters))
 
     @classmethod
     def after_compilation(cls, parameters: OscillatorParameters) -> "PlantPicture":

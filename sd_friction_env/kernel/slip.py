@@ -76,6 +76,13 @@ def select_field_in_slip(plant, mode, state, drive):
 
 
 @compiled
+def error_bounds(plant, mode, state, v_belt, a, h):
+    """Return the estimated error below which a step of h from a state is accepted, and what rounding may amount to."""
+    x, v = state
+    return TOLERANCE * h * max(1.0, abs(x), abs(v), STIFF * abs(a)), h * roundoff_floor(plant, mode, x, v, v_belt)
+
+
+@compiled
 def slip_until_event(plant, mode, state, drive, duration, until, trials, trial):
     """Slip for ``duration``, or until an event.
 
@@ -112,8 +119,7 @@ def slip_until_event(plant, mode, state, drive, duration, until, trials, trial):
             step = slip_step(now, mode, begin, here, h)
         first = False
         a, a_end, error = step.a, step.a_end, step.error
-        allowed = TOLERANCE * h * max(1.0, abs(x), abs(v), STIFF * abs(a))
-        noise = h * roundoff_floor(now, mode, x, v, belt)
+        allowed, noise = error_bounds(now, mode, begin, belt, a, h)
         gap = mode * (v - belt)
         gap_end = mode * (step.v - (belt + here.a_belt * h))
         slope = mode * (a - here.a_belt)

@@ -18,16 +18,15 @@ from sd_friction_env.kernel.codes import (
     SLIP_TRIALS,
     STEP_DOUBLING,
     STIFF,
-    TOLERANCE,
     V_REL_ZERO,
 )
 from sd_friction_env.kernel.compilation import compiled, in_lanes, reader
 from sd_friction_env.kernel.events import Surface, find_double_crossing, leaps_over_layer, look_at
-from sd_friction_env.kernel.forces import normal_force, normal_slope, restoring_slope, roundoff_floor, stick_load
+from sd_friction_env.kernel.forces import normal_force, normal_slope, restoring_slope, stick_load
 from sd_friction_env.kernel.plant import State, at_time, drive_at, select_field
 from sd_friction_env.kernel.plant_gradients import contact_gradient, external_gradient, ripple_gradient
 from sd_friction_env.kernel.runge_kutta import slip_stages
-from sd_friction_env.kernel.slip import select_field_in_slip
+from sd_friction_env.kernel.slip import error_bounds, select_field_in_slip
 from sd_friction_env.kernel.stick import NODES, WEIGHTS, ridden
 
 # The rows of tangents: x, v, the belt's speed and acceleration, the force, the integral of v^2, the time stuck and the
@@ -215,8 +214,7 @@ def carry_in_slip(plant, mode, state, drive, duration, tangents, directions, wor
             sources_of(now, mode, stages, here, h, directions, n - len(directions), work)
         step_tangents(tangents, h, work)
         # The motion's own steps, so that tangents are the derivative of what was computed; shorter where a law bends.
-        allowed = TOLERANCE * h * max(1.0, abs(x), abs(v), STIFF * abs(step.a))
-        noise = h * roundoff_floor(now, mode, x, v, here.v_belt)
+        allowed, noise = error_bounds(now, mode, State(x, v), here.v_belt, step.a, h)
         accepted = step.error <= max(allowed, noise)
         for j in range(n):
             dx, dv, rate = tangents[TANGENT_X, j], tangents[TANGENT_V, j], _end_of(work, 5, j)

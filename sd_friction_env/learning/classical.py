@@ -39,6 +39,7 @@ from sd_friction_env.control.policies import (
     VelocityFeedback,
 )
 from sd_friction_env.control.policies.feedback import nearest_equilibrium
+from sd_friction_env.environments.ids import bare_id
 from sd_friction_env.environments.jacobian import step_with_jacobian
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.versions import versions
@@ -519,7 +520,7 @@ def classical_controllers(env_id: str, path: Path | None = None) -> dict[str, Po
     Raises:
         NotTunedError: if none is stored for it. ValueError: if the file does not hold gains.
     """
-    env_id = env_id.rpartition(":")[2]
+    env_id = bare_id(env_id)
     found = stored_gains(path).get(env_id)
     if not found:
         raise NotTunedError(f"no tuned controllers are stored for {env_id!r}: run sd-friction tune-classical")
@@ -530,6 +531,6 @@ def best_controller(env_id: str) -> tuple[str, Policy]:
     """Return name and controller of an environment's best tuned one: by suppressed share, then by return, both in the
     validation episodes.
     """
-    controllers, gains = classical_controllers(env_id), stored_gains()[env_id.rpartition(":")[2]]
+    controllers, gains = classical_controllers(env_id), stored_gains()[bare_id(env_id)]
     best = max(controllers, key=lambda name: (gains[name]["suppressed"], gains[name]["validation_return"]))
     return best, controllers[best]

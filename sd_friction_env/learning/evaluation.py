@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env import SDFrictionEnv, SDFrictionVectorEnv, Table
 from sd_friction_env.control.policies import Policy, State, ZeroPolicy
+from sd_friction_env.environments.single import make_env as make_env
 from sd_friction_env.learning import optimal
 from sd_friction_env.learning.scores import NO_INTERVAL, RESAMPLES, credited_score, score, score_interval
 from sd_friction_env.physics.parameters import checked_number
@@ -62,14 +63,6 @@ class Episodes:
     mean_belt_speed: Array
     action: Array
     completed: NDArray[np.bool_]
-
-
-def make_env(env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> SDFrictionEnv:
-    """Return a bare environment (without wrappers, which cost more time than the step)."""
-    env = gym.make(env_id, **dict(env_kwargs or {})).unwrapped
-    if not isinstance(env, SDFrictionEnv):
-        raise TypeError(f"env_id must name an environment of sd_friction_env, got {env_id!r}")
-    return env
 
 
 def checked_seeds(seeds: Iterable[Any]) -> list[int]:

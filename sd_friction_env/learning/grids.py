@@ -64,8 +64,7 @@ def evaluation_grid(
     chunks = [(policy, env_id, names, piece, seeds) for piece in pieces]
     results = run_chunks(_chunk, chunks, engine, description=description)
     columns: dict[str, Any] = dict(zip(names, np.array(points).T, strict=True))
-    columns |= {name: np.concatenate([part[name] for part in results]) for name in results[0]}
-    return Table(columns, {"env_id": env_id, "episodes": len(seeds)})
+    return Table(columns | dict(Table.stacked(results)), {"env_id": env_id, "episodes": len(seeds)})
 
 
 def _chunk(chunk: tuple[Policy, str, tuple[str, ...], list[tuple[float, ...]], list[int]]) -> Columns:

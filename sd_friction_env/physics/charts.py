@@ -108,14 +108,9 @@ def stability_chart(
     starts += tuple(value for value in near if low < value < high)
     folds = _curve(requests[0]._replace(curve="fold", starts=starts))
     parts.append({column: values[folds["kind"] != "none"] for column, values in folds.items()})
-    curves = Table({column: np.concatenate([part[column] for part in parts]) for column in parts[0]}, metadata)
+    curves = Table.stacked(parts, metadata)
     regions = _regions(curves, requests[0])
-    return Table(
-        {column: np.append(values, [row[column] for row in regions]) for column, values in curves.items()}
-        if regions
-        else curves,
-        metadata,
-    )
+    return Table.stacked([curves, Table.from_rows(regions)], metadata) if regions else curves
 
 
 def _checked(parameters: Any, over: Any, against: Any) -> tuple[str, float, float]:
@@ -162,7 +157,7 @@ def _curve(request: Request) -> Columns:
             row["first_lyapunov_coefficient"] = point.values.get("Bautin", math.nan)
             rows.append(row)
         branches += 1
-    return {column: np.array([row[column] for row in rows]) for column in rows[0]}
+    return dict(Table.from_rows(rows))
 
 
 def _branches(request: Request) -> Iterator[tuple[float, Curve | str]]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -96,8 +97,7 @@ def refined_curve(
     added = np.concatenate((edge - 1e-9, [v_b0 + 1e-9, v_b1 + 1e-9]))
     added = added[(added > speeds.min()) & (added < speeds.max())]  # NaN, where there is none, is not
     curve = amplitude_curve(parameters, np.unique(np.concatenate((speeds, added))), x=x, v=v)
-    ends = {name: np.full(curve.n_rows, value) for name, value in (("v_b0", v_b0), ("v_b1", v_b1))}
-    return Table(ends | dict(curve), curve.metadata)
+    return curve.labelled(v_b0=v_b0, v_b1=v_b1)
 
 
 def attractor_curves(parameters: OscillatorParameters, belt_speeds: ArrayLike) -> Table:
@@ -147,6 +147,6 @@ def _table(rows: list[dict[str, Any]], parameters: OscillatorParameters) -> Tabl
     return cycle_table({name: [row[name] for row in rows] for name in names}, parameters)
 
 
-def cycle_table(columns: dict[str, Any], parameters: OscillatorParameters) -> Table:
+def cycle_table(columns: Mapping[str, Any], parameters: OscillatorParameters) -> Table:
     """Return columns of cycles as a table with the oscillator in its metadata."""
     return Table(columns, {"parameters": dataclasses.asdict(parameters)})

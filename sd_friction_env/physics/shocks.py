@@ -206,7 +206,7 @@ def basin_integrity(
     if not rows:
         return without_attractors("no attractor that keeps contact was found")
     metadata = {"parameters": dataclasses.asdict(parameters), "starts": starts, "scales": list(scales), "seed": seed}
-    return Table({name: [row[name] for row in rows] for name in rows[0]}, metadata)
+    return Table.from_rows(rows, metadata)
 
 
 def without_attractors(note: str) -> Table:
@@ -214,4 +214,4 @@ def without_attractors(note: str) -> Table:
     row: dict[str, Any] = {"attractor": UNDECIDED, "kind": "none"}
     row |= dict.fromkeys(("amplitude", "x_max", "x_min", "fraction", "fraction_low", "fraction_high"), math.nan)
     row |= {"shock": math.nan} | dict.fromkeys(Shock._fields[1:5], math.nan) | {"reaches": UNDECIDED, "note": note}
-    return Table({name: [value] for name, value in row.items()})
+    return Table.from_rows([row])

@@ -93,20 +93,19 @@ def amplitude_sweep(
     size = checked_count("chunk", chunk, 1, _MOST)
     pieces = [speeds[i : i + size] for i in range(0, len(speeds), size)]
     chunks = [(plant, piece, x, v, all_attractors) for plant in plants for piece in pieces]
-    description = {
-        "what": "amplitude",
-        "plants": [dataclasses.asdict(plant) for plant in plants],
-        "belt_speeds": speeds.tolist(),
-        "start": [x, v],
-        "all_attractors": all_attractors,
-        "chunk": size,
-    }
+    how = {"belt_speeds": speeds.tolist(), "start": [x, v], "all_attractors": all_attractors, "chunk": size}
+    description = _described("amplitude", plants, **how)
     results = run_chunks(_amplitude_chunk, chunks, engine, description=description)
     tables = []
     for i, plant in enumerate(plants):
         parts = results[i * len(pieces) : (i + 1) * len(pieces)]
-        tables.append(cycle_table({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, plant))
+        tables.append(cycle_table(Table.stacked(parts), plant))
     return tables
+
+
+def _described(what: str, plants: Sequence[OscillatorParameters], **arguments: Any) -> dict[str, Any]:
+    """Return a sweep's description, as :func:`run_chunks` takes it."""
+    return {"what": what, "plants": [dataclasses.asdict(plant) for plant in plants], **arguments}
 
 
 def _amplitude_chunk(chunk: tuple[OscillatorParameters, NDArray[np.float64], float, float | None, bool]) -> Columns:
@@ -267,8 +266,7 @@ def branch_sweep(
         stroboscope(plant, None, repeats=True).checked_start(x, v)
         over, points = checked_branch(plant, over, points)
     start, how = {"x": x, "v": v, "transient": transient}, {"points": points, "doublings": doublings}
-    described = [dataclasses.asdict(plant) for plant in plants]
-    description = {"what": "branches", "plants": described, "over": list(over), "start": start, **how}
+    description = _described("branches", plants, over=list(over), start=start, **how)
     results = run_chunks(_branch_chunk, [(p, over, start, how) for p in plants], engine, description=description)
     return [Table(columns, {"over": over[0], "range": list(over[1:]), **how}) for columns in results]
 
@@ -304,8 +302,7 @@ def integrity_sweep(
     check_search(starts, scales, limit, seed)
     arguments = {"starts": starts, "scales": list(scales), "limit": limit, "seed": seed}
     limits = [x.tolist(), v.tolist()]
-    described = [dataclasses.asdict(plant) for plant in plants]
-    description = {"what": "integrity", "plants": described, "limits": limits, **arguments}
+    description = _described("integrity", plants, limits=limits, **arguments)
     chunks = [(plant, limits, arguments) for plant in plants]
     return [Table(columns) for columns in run_chunks(_integrity_chunk, chunks, engine, description=description)]
 
@@ -339,8 +336,7 @@ def _diagram_sweep(
         first = _DIAGRAMS[what](plant, name, numbers[:1], **(arguments | {"cycles": 20, "transient": 0}))
         metadata.append(first.metadata)
     chunks = [(what, plant, name, numbers, arguments) for plant in plants]
-    described = [dataclasses.asdict(plant) for plant in plants]
-    description = {"what": what, "plants": described, "name": name, "values": numbers, **arguments}
+    description = _described(what, plants, name=name, values=numbers, **arguments)
     results = run_chunks(_diagram_chunk, chunks, engine, description=description)
     return [Table(columns, known) for columns, known in zip(results, metadata, strict=True)]
 

@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import IO, Any
 
 import numpy as np
@@ -33,6 +33,17 @@ class Table(dict[str, NDArray[Any]]):
         """Return rows as a table with the columns of all of them, in that order; NaN where a row has no value."""
         names = dict.fromkeys(name for row in rows for name in row)
         return cls({name: [row.get(name, math.nan) for row in rows] for name in names}, metadata)
+
+    @classmethod
+    def stacked(cls, tables: Iterable[Mapping[str, Any]], metadata: Mapping[str, Any] | None = None) -> "Table":
+        """Return tables of the same columns, one below the other."""
+        parts = list(tables)
+        return cls({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, metadata)
+
+    def labelled(self, **values: Any) -> "Table":
+        """Return the table with a column in front for each of the values, which is the same in all rows."""
+        labels = {name: np.full(self.n_rows, value) for name, value in values.items()}
+        return Table(labels | dict(self), self.metadata)
 
     def __repr__(self) -> str:
         return f"Table of {self.n_rows} rows: {', '.join(self)}"

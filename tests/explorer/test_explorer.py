@@ -19,6 +19,7 @@ from bokeh.events import ButtonClick
 from scripts import explorer_latency
 from sd_friction_env import OscillatorParameters, amplitude_curve, limit_cycle, load_pretrained, stability_chart
 from sd_friction_env.cli.main import main
+from sd_friction_env.environments.task import passive_motion
 from sd_friction_env.explorer import model
 from sd_friction_env.explorer import page as page_module
 from sd_friction_env.explorer.model import (
@@ -35,7 +36,6 @@ from sd_friction_env.explorer.model import (
     chart_picture,
     controllers,
     passive_curve,
-    passive_cycle,
 )
 from sd_friction_env.explorer.page import Page
 from sd_friction_env.explorer.server import make_server, served_hosts
@@ -134,7 +134,7 @@ def test_a_changed_plant_is_the_plant_that_is_shown():
     plant = OscillatorParameters(alpha=0.7, belt_speed=0.3)
     assert live.loop.env.parameters == plant
     assert live.loop.info["x"] == before
-    cycle = passive_cycle(live.parameters)
+    cycle = passive_motion(live.parameters)
     assert cycle is not None
     assert cycle.amplitude == limit_cycle(plant).amplitude
     curve = passive_curve(live.parameters)
@@ -277,7 +277,7 @@ def test_another_friction_law_and_excitation_are_shown_and_the_curve_is_of_the_p
     page.plant_work.executor = futures.ThreadPoolExecutor(1)
     follow(page)
     assert page.live.loop.env.parameters.excited
-    cycle = passive_cycle(page.live.parameters)
+    cycle = passive_motion(page.live.parameters)
     assert cycle is not None
     assert cycle.amplitude == limit_cycle(plant).amplitude
     belts = page.live.advance(40)["v_belt"]

@@ -1,6 +1,6 @@
 """Tangents through stick and slip: against differences of the motion, compiled as interpreted, and what has none."""
 
-import importlib.util
+import itertools
 import math
 import os
 import subprocess
@@ -9,20 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import mathieu_a, mathieu_b
 
 from sd_friction_env import OscillatorParameters, kernel
+from sd_friction_env.physics.forced import drive_period
+from tests.kernel import random_motions
 
 ROOT = Path(__file__).parents[2]
-_spec = importlib.util.spec_from_file_location("derivatives", ROOT / "scripts" / "derivatives.py")
-derivatives = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(derivatives)
 NOMINAL = OscillatorParameters().kind
 
 
 def motions(accept, count, seed):
     rng = np.random.default_rng(seed)
     while count:
-        motion = derivatives.random_motion(rng)
+        motion = random_motions.random_motion(rng)
         if accept(motion.parameters):
             count -= 1
             yield motion
@@ -32,17 +32,17 @@ def worst_errors(chosen):
     """The largest error of each motion's Jacobian, and the kinds of events that were met."""
     errors, met = [], set()
     for motion in chosen:
-        names = derivatives.names_of(motion)
-        end, exact = derivatives.jacobian_of(motion, names)
+        names = random_motions.names_of(motion)
+        end, exact = random_motions.jacobian_of(motion, names)
         if end.status != kernel.OK or end.derivative > kernel.FROM_BELT:
             continue
-        met |= set(derivatives.end_of(motion, names, np.zeros(5 + len(names)))[1][1:])
+        met |= set(random_motions.end_of(motion, names, np.zeros(5 + len(names)))[1][1:])
         stuck, scale = end.derivative == kernel.FROM_BELT, np.abs(exact).max()
         for column in range(exact.shape[1]):
             if stuck and column == 1:
                 continue
             wanted = exact[:, column] + (exact[:, 1] if stuck and column == 2 else 0.0)
-            found, spread = derivatives.differences(motion, names, column, stuck)
+            found, spread = random_motions.differences(motion, names, column, stuck)
             if spread < 1e-10 * scale:
                 errors.append(np.abs(wanted - found).max() / scale)
     return np.array(errors), met
@@ -67,8 +67,9 @@ def test_interpreted_tangents_of_every_law_are_those_of_the_motion():
     code = (
         "import numpy as np\n"
         "from sd_friction_env import kernel\n"
-        "from tests.kernel.test_sensitivity import derivatives, motions, worst_errors\n"
-        "kinds = lambda m: derivatives.end_of(m, [], np.zeros(5))[1][1:]\n"
+        "from tests.kernel import random_motions\n"
+        "from tests.kernel.test_sensitivity import motions, worst_errors\n"
+        "kinds = lambda m: random_motions.end_of(m, [], np.zeros(5))[1][1:]\n"
         "chosen = [m for m in motions(lambda p: True, 90, 3) if m.duration < 3.0 and kinds(m)][:14]\n"
         "errors, met = worst_errors(chosen)\n"
         "assert len(errors) > 150, len(errors)\n"
@@ -106,6 +107,24 @@ def test_what_has_no_derivative_is_told():
     assert rows[:2] == pytest.approx(
         np.array([[math.cos(3.0), math.sin(3.0)], [-math.sin(3.0), math.cos(3.0)]]), abs=1e-11
     )
+
+
+@pytest.mark.parametrize("edge", [mathieu_a, mathieu_b])
+def test_on_the_edges_of_mathieus_tongues_the_trace_is_two(edge):
+    for order, q in itertools.product(range(1, 5), (0.05, 0.2, 0.4)):
+        a = float(edge(order, q))
+        if not 2.0 * q <= a:
+            continue
+        p = OscillatorParameters(
+            geometry="linear",
+            mu_s=0.0,
+            mu_m=0.0,
+            beta=0.0,
+            stiffness_amplitude=2.0 * q / a,
+            stiffness_frequency=2.0 / math.sqrt(a),
+        )
+        _, rows = tangent(p, 1.0, 0.2, drive_period(p))
+        assert abs(np.trace(rows[:2])) == pytest.approx(2.0, abs=1e-9)
 
 
 def test_many_tangents_are_stepped_as_few_are():

@@ -382,7 +382,7 @@ def test_the_script_refuses_bad_arguments_in_one_line(tmp_path, capsys):
         ([str(tmp_path / "x.npz"), "--task", "force"], "is not a policy"),
         ([str(tmp_path / "seven.npz")], "name it with --task"),
         ([str(tmp_path / "seven.npz"), "--task", "force"], "observes 7 values"),
-        (["--task", "force", "--csv", str(tmp_path / "no" / "x.csv")], "--csv must be"),
+        (["--task", "force", "--csv", str(tmp_path / "no" / "x.csv")], "lies in no existing folder"),
         (["--task", "force", "--env-arg", "w_effort=-1"], "w_effort"),
         (["--task", "force", "--tier", "sensed", "--controller", "velocity-feedback"], "sees the position only"),
         (["--task", "force", "--controller", "threshold-follower"], "needs the actuator 'belt_speed', got 'force'"),

@@ -157,7 +157,7 @@ def test_a_model_that_differs_is_not_written(tmp_path, monkeypatch, capsys):
     [
         (["--out", "a.onnx"], "name a run folder or a policy.npz, or --task"),
         (["--task", "force", "--out", "a.txt"], "--out must end in .onnx"),
-        (["--task", "force", "--out", "nowhere/a.onnx"], "in a folder that exists"),
+        (["--task", "force", "--out", "nowhere/a.onnx"], "lies in no existing folder"),
         (["--task", "force", "--out", "a.onnx", "--trials", "1"], "--trials must be at least 2, got 1"),
         (["nothing.npz", "--task", "force", "--out", "a.onnx"], "nothing.npz"),
         (["nothing.npz", "--out", "a.onnx"], "nothing.npz"),

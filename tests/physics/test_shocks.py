@@ -1,9 +1,10 @@
 """The smallest shock that leaves a basin against brute force, shares with intervals, and labels on disk."""
 
+import math
+
 import numpy as np
 import pytest
 
-from scripts import signals_and_shocks
 from sd_friction_env import OscillatorParameters, attractors, basin_grid
 from sd_friction_env.physics.basins import basins
 from sd_friction_env.physics.shocks import basin_integrity, smallest_shock
@@ -11,17 +12,37 @@ from sd_friction_env.physics.sweeps import Engine, basin_file, integrity_sweep
 
 EXACT = OscillatorParameters()
 BISTABLE = EXACT.replace(geometry="linear", friction="exponential", mu_s=1.0, mu_k=0.5, v_0=0.5)
+SHAKEN = [
+    *(EXACT.replace(alpha=alpha, belt_speed=speed) for alpha, speed in ((0.5, 0.43), (0.7, 0.46))),
+    *(EXACT.replace(geometry="cubic", alpha=alpha, belt_speed=0.46) for alpha in (0.5, 0.7)),
+    *(BISTABLE.replace(belt_speed=speed) for speed in (1.3, 1.7)),
+]
+STEP = 0.02  # of the grid of shocks, in x and v
 
 
-@pytest.mark.parametrize("plant", signals_and_shocks.SHAKEN)
+def smallest_on_grid(plant, cycle, label, shock, phases=32):
+    """Return the smallest shock of a square grid, at phases of a cycle, after which a motion ends elsewhere."""
+    size = np.arange(-2.0, 2.0 + STEP, STEP)
+    dx, dv = np.meshgrid(size, size)
+    sizes = np.hypot(dx, dv)
+    near = sizes < shock.size + 3.0 * STEP
+    smallest = math.inf
+    for phase in np.arange(phases if cycle.period > 0.0 else 1) / phases:
+        x, v = cycle.state(phase)
+        labels = basins(plant, x + dx[near], v + dv[near]).labels
+        smallest = min(smallest, sizes[near][(labels != label) & (labels != -2)].min(initial=math.inf))
+    return smallest
+
+
+@pytest.mark.parametrize("plant", SHAKEN)
 def test_the_smallest_shock_is_below_brute_force_and_within_its_step(plant):
     found = attractors(plant)
     assert len(found) == 2
     for label, cycle in enumerate(found):
         shock = smallest_shock(cycle, starts=4000)
-        smallest = signals_and_shocks.smallest_on_grid(plant, cycle, label, shock)
+        smallest = smallest_on_grid(plant, cycle, label, shock)
         assert shock.size <= smallest
-        assert smallest - shock.size < np.sqrt(2.0) * signals_and_shocks.STEP
+        assert smallest - shock.size < np.sqrt(2.0) * STEP
         after, inside = (basins(plant, shock.x + k * shock.dx, shock.v + k * shock.dv).labels for k in (1.0, 0.999))
         assert (int(after), int(inside)) == (shock.reaches, label)
 

@@ -69,11 +69,7 @@ class SoftBelt(SampledFeedback):
         **dict.fromkeys(("damping", "stiffness", "mount_stiffness"), (0.0, 1e9)),
     }
     _needs_velocity = True
-
-    def __post_init__(self) -> None:
-        if self.readings.actuator != "belt_speed":
-            raise ValueError(f"SoftBelt needs the actuator 'belt_speed', got {self.readings.actuator!r}")
-        super().__post_init__()
+    _needs_belt = True
 
     @classmethod
     def from_env(cls, env: Any, *arguments: Any, **named: Any) -> Self:

@@ -92,6 +92,24 @@ class Readings:
             values[..., 1] *= self.v_scale
         return values
 
+    def states(self, values: _Floats, belt_speed: float) -> _Floats:
+        """Return the states (x, v, v_belt), shape (..., 3), of readings (..., k) with the velocity.
+
+        Args:
+            values: as :meth:`read` returns them. belt_speed: nominal.
+
+        Raises:
+            ValueError: if one is not finite.
+        """
+        if not np.isfinite(values).all():
+            raise ValueError("observation must be finite")
+        states = np.full((*values.shape[:-1], 3), belt_speed)
+        states[..., 0] = values[..., 0] + self.x_equilibrium
+        states[..., 1] = values[..., 1]
+        if values.shape[-1] > 2:
+            states[..., 2] += self.authority * values[..., 2]
+        return states
+
 
 @dataclass(frozen=True)
 class Feedback:
@@ -101,7 +119,8 @@ class Feedback:
         readings: of the environment to be controlled.
 
     Raises:
-        TypeError, ValueError: if a number is not as said, or the velocity is needed and not observed.
+        TypeError, ValueError: if a number is not as said, the actuator is another one than needed, or the velocity is
+            needed and not observed.
     """
 
     _: KW_ONLY
@@ -109,8 +128,11 @@ class Feedback:
 
     _ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}  # of the controller's numbers, by name
     _needs_velocity: ClassVar[bool] = False
+    _needs_belt: ClassVar[bool] = False  # as the actuator
 
     def __post_init__(self) -> None:
+        if self._needs_belt and self.readings.actuator != "belt_speed":
+            raise ValueError(f"{type(self).__name__} needs the actuator 'belt_speed', got {self.readings.actuator!r}")
         for name, (low, high) in self._ranges.items():
             object.__setattr__(self, name, checked_number(name, getattr(self, name), low, high))
         if self._needs_velocity and not self.readings.sees_velocity:

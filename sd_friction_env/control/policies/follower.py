@@ -52,11 +52,7 @@ class ThresholdFollower(Feedback):
         "belt_authority": (1e-9, 1e9),
     }
     _needs_velocity = True
-
-    def __post_init__(self) -> None:
-        if self.readings.actuator != "belt_speed":
-            raise ValueError(f"{type(self).__name__} needs the actuator 'belt_speed', got {self.readings.actuator!r}")
-        super().__post_init__()
+    _needs_belt = True
 
     @classmethod
     def from_env(cls, env: Any, *arguments: Any, **named: Any) -> Self:

@@ -97,14 +97,8 @@ class LookAhead(Feedback):
         Raises:
             ValueError: if one is not finite.
         """
-        if not np.isfinite(values).all():
-            raise ValueError("observation must be finite")
         belt_speed = self.model.parameters.belt_speed
-        states = np.full((*values.shape[:-1], 3), belt_speed)
-        states[..., 0] = values[..., 0] + self.readings.x_equilibrium
-        states[..., 1] = values[..., 1]
-        if values.shape[-1] > 2:
-            states[..., 2] += self.readings.authority * values[..., 2]
+        states = self.readings.states(values, belt_speed)
         # A mass that sticks has the belt's speed exactly, but for the observation's single precision.
         rides = np.abs(states[..., 1] - states[..., 2]) <= 1e-6 * max(belt_speed, 1.0)
         states[..., 1] = np.where(rides, states[..., 2], states[..., 1])

@@ -13,13 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.control.policies import Feedback, PolicyFileError, Readings, State
 from sd_friction_env.control.policies.planning import base_controller
+from sd_friction_env.environments.ids import bare_id
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.environments.task import Task
 from sd_friction_env.learning.optimal.grid import Grid, ValueFunction
-from sd_friction_env.learning.optimal.problem import TASKS, Array, Problem, make_bare_env, step_plant
+from sd_friction_env.learning.optimal.problem import TASKS, Array, Problem, step_plant
 from sd_friction_env.learning.optimal.search import deeper, look_ahead
 from sd_friction_env.learning.optimal.stored import (
     OPTIMUM_DIRECTORY,
-    bare_id,
     check_fingerprint,
     command_of,
     fingerprint,
@@ -84,7 +85,7 @@ class OptimalPolicy:
         path = value_path(env_id, directory) if env_id in TASKS.values() else None
         if path is None or not path.exists():
             raise FileNotFoundError(f"no value function is stored for {env_id!r}; allowed: {', '.join(TASKS.values())}")
-        env = make_bare_env(env_id)
+        env = make_env(env_id)
         try:
             arrays = load_arrays(path, "f", texts=("fingerprint",))
             lows, highs, values = arrays["lows"], arrays["highs"], arrays["values"]
@@ -152,13 +153,7 @@ class OptimalPolicy:
             ValueError: if an observation is not finite or too short.
         """
         values = self.readings.read(observation)
-        if not np.isfinite(values).all():
-            raise ValueError("observation must be finite")
-        states = np.full((*values.shape[:-1], 3), self.parameters.belt_speed)
-        states[..., 0] = values[..., 0] + self.readings.x_equilibrium
-        states[..., 1] = values[..., 1]
-        if self.task.actuator == "belt_speed":
-            states[..., 2] += self.readings.authority * values[..., 2]
+        states = self.readings.states(values, self.parameters.belt_speed)
         actions = self.actions(states.reshape(-1, 3)).reshape(values.shape[:-1])
         if self.base is not None:
             near = values[..., 0] ** 2 + values[..., 1] ** 2 <= self.radius**2

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +14,7 @@ from sd_friction_env.control.shooting import rollout
 from sd_friction_env.environments import ids
 from sd_friction_env.environments.ids import environment_id
 from sd_friction_env.environments.jacobian import control_jacobians, control_steps
-from sd_friction_env.environments.single import SDFrictionEnv
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.environments.task import Task, drifted
 from sd_friction_env.physics.parameters import OscillatorParameters
 
@@ -167,7 +166,7 @@ def step_plant(
 
 def make_problem(env_id: str, seeds: Sequence[int]) -> Problem:
     """Return the problem of an environment with the starts and the plants of ``reset(seed=...)``."""
-    env = make_bare_env(env_id)
+    env = make_env(env_id)
     starts = np.empty((len(seeds), 3))
     parameters, ends = [], []
     for i, seed in enumerate(seeds):
@@ -178,10 +177,3 @@ def make_problem(env_id: str, seeds: Sequence[int]) -> Problem:
         drifts = env.task.drift_ends(np.array([state.key]), np.array([state.episode]))
         ends.append(tuple(float(end[0]) for end in drifts.values()))
     return Problem(env_id, env.task, tuple(parameters), starts, tuple(ends))
-
-
-def make_bare_env(env_id: str) -> SDFrictionEnv:
-    """Return an environment without wrappers."""
-    env = gym.make(env_id).unwrapped
-    assert isinstance(env, SDFrictionEnv)
-    return env

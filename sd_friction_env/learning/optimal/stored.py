@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sd_friction_env.control.pretrained import close
+from sd_friction_env.control.pretrained import close, configuration_changes, golden_actions
+from sd_friction_env.environments.ids import bare_id
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning.optimal.problem import (
     OPEN,
     RANDOMISED,
@@ -19,7 +21,6 @@ from sd_friction_env.learning.optimal.problem import (
     TASKS,
     Array,
     Problem,
-    make_bare_env,
     make_problem,
 )
 from sd_friction_env.storage import (
@@ -41,7 +42,6 @@ _FILES = {
     **{OPEN[tier]["belt"]: f"belt-{tier}" for tier in ("blind-hard", "drifting", "excited")},
 }
 ACTION_LEVELS = 32767  # stored actions are whole numbers of 1/32767: half the size, and far finer than it matters
-GOLDEN_STEPS = 60
 GOLDEN_TOLERANCE = 1e-7  # other builds round differently, and stick-slip may amplify that; a changed law moves 1e-3
 _UNSEEN = ("sensor", "sensor_noise", "sensor_delay", "observation_limit", "x_offset", "x_scale", "v_scale")
 
@@ -65,7 +65,7 @@ def fingerprint(env_id: str, seeds: Sequence[int]) -> dict[str, Any]:
 
     Where parameters are randomised, ``draws`` holds those of each seed, in the order of their names.
     """
-    env = make_bare_env(env_id)
+    env = make_env(env_id)
     task = {name: value for name, value in dataclasses.asdict(env.task).items() if name not in _UNSEEN}
     configuration = {"task": task, "parameters": dataclasses.asdict(env.nominal)}
     problem = make_problem(env_id, seeds)
@@ -73,9 +73,7 @@ def fingerprint(env_id: str, seeds: Sequence[int]) -> dict[str, Any]:
     draws = {"draws": [[getattr(plant, name) for name in names] for plant in problem.parameters]} if names else {}
     env.reset(options={"x": 0.0}, seed=0)
     golden = []
-    for t in range(GOLDEN_STEPS):
-        # Each push lasts three intervals: the mass crosses, sticks and breaks away, on both actuators.
-        action = np.array([(7 * (t // 3) % 11) / 5.0 - 1.0], np.float32)
+    for action in golden_actions():
         _, reward, _, _, info = env.step(action)
         golden.append([info["x"], info["v"], info["v_belt"], float(reward)])
     starts = problem.starts[:, :2].tolist()
@@ -89,16 +87,7 @@ def check_fingerprint(stored: dict[str, Any], env_id: str, seeds: Sequence[int])
         RuntimeError: naming what changed.
     """
     now = fingerprint(env_id, seeds)
-    changed = []
-    for part, values in now["configuration"].items():
-        # An argument added since then has a default; the golden rollout shows whether that changes anything.
-        configuration = stored.get("configuration")
-        before = configuration.get(part) if isinstance(configuration, dict) else None
-        if not isinstance(before, dict) or not before:
-            changed.append(f"{part}: not stored")
-            continue
-        names = sorted(name for name in before if before[name] != values.get(name))
-        changed += [f"{part} {name}: {before.get(name)!r} -> {values.get(name)!r}" for name in names]
+    changed = configuration_changes(stored, now)
     for part, what in (
         ("starts", "the starts of the evaluation seeds"),
         ("draws", "the parameters of the evaluation seeds"),
@@ -214,11 +203,6 @@ def stored_returns(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> dict[int
     if env_id not in _FILES or not _paths(env_id, directory)[0].exists():
         return None
     return dict(_checked_table(env_id, directory))
-
-
-def bare_id(env_id: str) -> str:
-    """Return an environment's id without the module before it."""
-    return env_id.rpartition(":")[2]
 
 
 def optimal_actions(env_id: str, directory: Path = OPTIMUM_DIRECTORY) -> tuple[list[int], NDArray[np.float32]]:

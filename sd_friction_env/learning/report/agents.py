@@ -9,7 +9,7 @@ from typing import Any
 
 from sd_friction_env import Table
 from sd_friction_env.control.policies import NetworkPolicy
-from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
+from sd_friction_env.environments.ids import TASKS, TIERS, bare_id, environment_id
 from sd_friction_env.learning import runs
 from sd_friction_env.learning.settings import ALGORITHMS, one_line
 
@@ -53,7 +53,7 @@ def find_agents(folder: Path) -> tuple[list[Agent], list[str]]:
         policy, config = runs.load_network(place), runs.load_config(place)
         expected: tuple[Any, ...] = (ENV_IDS[task, tier], {}, algorithm, int(seed))
         environment = config["environment"]
-        stored = (environment["id"].rpartition(":")[2], environment["kwargs"], config["algorithm"], config["seed"])
+        stored = (bare_id(environment["id"]), environment["kwargs"], config["algorithm"], config["seed"])
         if stored != expected:
             raise runs.RunFolderError(f"{str(place)!r} must hold {expected}, as its name says; it holds {stored}")
         agents.append(Agent(place.name, task, tier, algorithm, int(seed), policy, _evaluations(place)))

@@ -595,7 +595,7 @@ def orbit_branches(
         columns["x"], columns["v"] = np.concatenate([orbit.points for orbit in branch.orbits]).T
         parts.append(columns)
     metadata = {"over": over[0], "range": list(over[1:]), "points": points}
-    return Table({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, metadata)
+    return Table.stacked(parts, metadata)
 
 
 def begins_at(branch: OrbitBranch, flip: ForcedOrbit) -> bool:
@@ -614,4 +614,4 @@ def without_branch(name: str, value: float, reason: str) -> Table:
     row |= dict.fromkeys(("x", "v", "amplitude", "x_min", "x_max", "period", "stick_fraction"), math.nan)
     row |= {"sequence": "", "stable": False, "multiplier": math.nan, "multiplier_imag": math.nan}
     row |= dict.fromkeys(("second_multiplier", "residual", "condition"), math.nan)
-    return Table({column: np.array([cell]) for column, cell in (row | {"reason": reason}).items()})
+    return Table.from_rows([row | {"reason": reason}])

@@ -164,7 +164,7 @@ def _continued(
     direction: Direction,
     measured: Callable[[Stroboscope, State], tuple[dict[str, Any], State | None]],
     start: tuple[float, float | None],
-) -> dict[str, Any]:
+) -> Table:
     """Return the columns that ``measured`` gives at each value, from the state in which it left the one before."""
     checked_choice("direction", direction, get_args(Direction))
     points[0][1].checked_start(*start)
@@ -176,7 +176,7 @@ def _continued(
             part, state = measured(strobe, state or strobe.checked_start(*start))
             rows = len(next(iter(part.values())))
             parts.append({"value": np.full(rows, value), "direction": np.full(rows, way), **part})
-    return {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+    return Table.stacked(parts)
 
 
 def _section_at(

@@ -8,6 +8,7 @@ the limit cycle from its largest x on, the other starts beside steady slip and g
 known. Guesses are up to 20% off. "inside" counts the seeds whose 95% interval holds the true value.
 """
 
+import functools
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -17,21 +18,20 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
-from sd_friction_env import OscillatorParameters, equilibria, limit_cycle, simulate
+from sd_friction_env import LimitCycle, OscillatorParameters, equilibria, limit_cycle, simulate
 from sd_friction_env.cli.options import Parser
 from sd_friction_env.physics.simulation import Trajectory
 
 Array = NDArray[np.float64]
 
 NOMINAL = OscillatorParameters()
-CYCLE = limit_cycle(NOMINAL)
 PERIODS, DT, NOISE = 10, 0.1, 0.01
 SOUGHT = ("alpha", "mu_m", "v_m")
 TRUTH = np.array([NOMINAL.values[name] for name in SOUGHT])
 UNKNOWN = (*SOUGHT, "x", "v")
 LOWEST, HIGHEST = (0.1, 0.0, 0.1, -2.0, -1.0), (2.0, NOMINAL.mu_s, 10.0, 2.0, 1.0)
 WINDOWS = (1 / 8, 1 / 4, 1 / 2, 1)  # parts of the record: over all of it at once a wrong guess is out of phase
-STARTS = {"limit cycle": (CYCLE.x_max, 0.0), "growth": (equilibria(NOMINAL)[0].x, 0.05)}
+STARTS = ("limit cycle", "growth")
 VARIANTS: dict[str, dict[str, Any]] = {
     "as above": {},
     "forward differences": {"jacobian": "2-point"},
@@ -61,6 +61,17 @@ class Fit(NamedTuple):
     def autocorrelation(self) -> float:
         """Correlation of each residual with the next."""
         return float(self.residuals[1:] @ self.residuals[:-1] / (self.residuals @ self.residuals))
+
+
+@functools.cache
+def cycle() -> LimitCycle:
+    """Return the nominal limit cycle."""
+    return limit_cycle(NOMINAL)
+
+
+def state_at(start: str) -> tuple[float, float]:
+    """Return x and v where a record begins."""
+    return (cycle().x_max, 0.0) if start == "limit cycle" else (equilibria(NOMINAL)[0].x, 0.05)
 
 
 def motion(values: Array, t: Array, sensitivities: Sequence[str] = ()) -> Trajectory:
@@ -103,8 +114,8 @@ def standard_deviations(jacobian: Array) -> Array:
 
 def record(law: str, start: str) -> tuple[Array, Array, float]:
     """Return the times and positions of a record without noise, and the noise to be added."""
-    x, v = STARTS[start]
-    t = DT * np.arange(int(PERIODS * CYCLE.period / DT) + 1)
+    x, v = state_at(start)
+    t = DT * np.arange(int(PERIODS * cycle().period / DT) + 1)
     found = simulate(NOMINAL.replace(**LAWS[law]), x, v, float(t[-1]), dt=DT)
     return np.asarray(t), found.x, NOISE * found.amplitude()
 
@@ -136,7 +147,7 @@ def recovery(seeds: int) -> None:
             each = "  ".join(f"{name} {k}" for name, k in zip(SOUGHT, hits.sum(axis=0), strict=True))
             print(f"{title:9} of {seeds}: {each}  all three {hits.all(axis=1).sum()}")
         t, x, _ = record("stribeck", start)
-        jacobian = residual_jacobian(np.array([*TRUTH, *STARTS[start]]), t, x)
+        jacobian = residual_jacobian(np.array([*TRUTH, *state_at(start)]), t, x)
         expected = noise * standard_deviations(jacobian)[:3] / TRUTH
         for title, spread in (("measured", errors.std(axis=0)), ("expected", expected)):
             print(

@@ -9,6 +9,8 @@ from scripts.hunting import against_scipy, events, steps
 from scripts.hunting.draws import Start
 from sd_friction_env import OscillatorParameters, attractors, equilibria, kernel, simulate
 
+pytestmark = pytest.mark.usefixtures("either_way")
+
 # A step of 4.8 to 5.7 times what friction damps in had a small estimate by accident, at the first step of a piece.
 OVERLONG_STEPS = [
     (
@@ -145,7 +147,10 @@ FAST_MOTIONS = [
 ]
 
 
-@pytest.mark.parametrize(("plant", "start"), FAST_MOTIONS)
+@pytest.mark.parametrize("either_way", ["compiled"], indirect=True)  # a second of compiled code
+@pytest.mark.parametrize(
+    ("plant", "start"), [pytest.param(*FAST_MOTIONS[0], marks=pytest.mark.slow), *FAST_MOTIONS[1:]]
+)
 def test_the_excitations_work_is_resolved_where_the_motion_is_fast(plant, start):
     balance = simulate(OscillatorParameters(**plant), **start, t_end=5.0, dt=1e3).energy
     works = (balance.damping, balance.contact, balance.control, balance.excitation, balance.change)

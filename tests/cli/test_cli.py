@@ -79,6 +79,7 @@ def test_critical_gives_a_reason_where_there_is_no_number(capsys):
     assert "nothing oscillates" in none["reason"]
 
 
+@pytest.mark.usefixtures("either_way")
 def test_simulate_ends_at_t_end_and_loss_of_contact_is_a_failure(tmp_path, capsys):
     assert main(["simulate", "--t-end", "12.5", "--dt", "0.5", "--plot", str(tmp_path / "h.svg")]) == 0
     assert capsys.readouterr().out.splitlines()[-1].startswith("12.5,")
@@ -94,6 +95,7 @@ def test_basins_prints_fractions_and_draws_them(tmp_path, capsys):
     assert plot.stat().st_size > 5000
 
 
+@pytest.mark.usefixtures("either_way")
 def test_other_laws_are_chosen_and_swept(capsys):
     assert main(["cycle", "--friction", "coulomb", "hyperbolic", "--delta", "2", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]

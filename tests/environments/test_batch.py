@@ -169,6 +169,7 @@ def test_a_mask_resets_some_and_leaves_the_others_alone():
         assert differences(ours.step(actions), theirs.step(actions)) == []
 
 
+@pytest.mark.usefixtures("either_way")
 def test_contact_is_lost_as_in_a_single_environment():
     kwargs = {"parameters": {"geometry": "cubic", "alpha": 0.2}, "episode_steps": 100}
     for mode in ("NextStep", "SameStep"):
@@ -183,7 +184,7 @@ def test_contact_is_lost_as_in_a_single_environment():
         {"control_interval": 0.5},
         {"control_interval": 0.01},
         {"parameters": {"geometry": "linear"}},
-        {"parameters": {"geometry": "cubic", "alpha": 0.5}},
+        {"parameters": {"geometry": "cubic", "friction": "exponential", "mu_v": 0.02}},
         {"parameters": {"alpha": 0.05, "belt_speed": 0.1}},
         {"parameters": {"alpha": 0.001}},
         {"force_limit": 5.0},
@@ -250,7 +251,7 @@ def test_a_small_batch_has_no_use_for_threads():
     assert len(batch(num_envs=2048, threads=8).unwrapped._episodes._works) == 4
 
 
-def mixed_steps(total, seed):
+def mixed_steps(total, seed, geometries):
     """Compare batch and single environments over ``total`` steps of random tasks; return the steps and events met."""
     rng = np.random.default_rng(seed)
     done = events = 0
@@ -259,7 +260,7 @@ def mixed_steps(total, seed):
         ranges = {"alpha": (0.15, 1.0), "belt_speed": (0.05, 0.5), "mu_s": (0.15, 0.3), "mu_m": (0.02, 0.15)}
         names = rng.choice(list(ranges), 2, replace=False)
         kwargs = {
-            "parameters": {"geometry": str(rng.choice(["exact", "exact", "cubic", "linear"])), "alpha": 0.7},
+            "parameters": {"geometry": str(rng.choice(geometries)), "alpha": 0.7},
             "actuator": str(rng.choice(["force", "belt_speed"])),
             "force_limit": float(rng.choice([0.05, 0.5])),
             "belt_authority": float(rng.uniform(0.1, 1.0)),
@@ -288,13 +289,13 @@ def mixed_steps(total, seed):
 
 
 def test_batch_and_single_environments_agree_over_mixed_steps():
-    done, events = mixed_steps(60_000, seed=0)
+    done, events = mixed_steps(40_000, 0, ["exact", "exact", "linear"])
     assert events > 1000
 
 
 @pytest.mark.slow
 def test_batch_and_single_environments_agree_over_a_million_mixed_steps():
-    done, events = mixed_steps(1_000_000, seed=1)
+    done, events = mixed_steps(1_000_000, 1, ["exact", "exact", "cubic", "linear"])
     assert events > 20_000
 
 
@@ -365,6 +366,7 @@ def test_states_are_taken_and_given_back_to_the_bit():
         assert differences((observation, reward), (first[k][0][2], first[k][1][2])) == []
 
 
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("parameters", [{}, {"geometry": "cubic", "alpha": 0.2}])
 def test_a_state_knows_whether_its_episode_is_over(mode, parameters):
@@ -847,8 +849,8 @@ def steps(envs, count=5):
             digest.update(part.tobytes())
     return digest.hexdigest()
 
-def made(threads, **law):
-    envs = gym.make_vec("SDFriction/Force-v0", num_envs=2048, threads=threads, parameters=law)
+def made(threads):
+    envs = gym.make_vec("SDFriction/Force-v0", num_envs=2048, threads=threads)
     envs.reset(seed=0)
     return envs
 
@@ -894,13 +896,12 @@ def stepped_on(envs):
         "stepped_on(made(2)); twin = made(1); run = lambda: steps(made(2))",
         "total(np.ones(9)); envs, twin = made(2), made(1); run = lambda: steps(envs)",
         "envs, twin = made(2), made(1); run = lambda: steps(envs)",
-        # a child of the child, and another law
-        "envs, twin = (stepped_on(made(k, friction='coulomb')) for k in (2, 1)); run = twice(lambda: steps(envs))",
+        # a child of the child
+        "envs, twin = stepped_on(made(2)), stepped_on(made(1)); run = twice(lambda: steps(envs))",
     ],
 )
-@pytest.mark.parametrize("way", ["in_fork", "in_process"])
-def test_a_forked_process_steps_the_same_bits_whoever_has_started_threads(case, way):
-    code = f"{FORKING}\n{case}\nassert {way}(run) == steps(twin)\n"
+def test_a_forked_process_steps_the_same_bits_whoever_has_started_threads(case):
+    code = f"{FORKING}\n{case}\nfound = [in_fork(run), in_process(run)]\nassert found == [steps(twin)] * 2\n"
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=300)
 
 

@@ -189,6 +189,7 @@ def test_an_episode_is_truncated_after_its_steps_and_never_terminated_without_co
     assert all(type(flag) is bool for pair in ends for flag in pair)
 
 
+@pytest.mark.usefixtures("either_way")
 def test_losing_contact_terminates_and_costs_more_than_any_way_to_go_on():
     env = make(parameters={"geometry": "cubic", "alpha": 0.2}, episode_steps=100)
     env.reset(options={"x": 0.1, "v": 3.0})
@@ -230,6 +231,7 @@ LOSING = {
 }
 
 
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("case", LOSING)
 @pytest.mark.parametrize("actuator", ["force", "belt_speed"])
 def test_the_last_info_and_observation_are_of_the_moment_at_which_contact_is_lost(case, actuator):

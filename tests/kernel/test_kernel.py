@@ -24,6 +24,7 @@ from sd_friction_env.physics.parameters import (
 EXACT = OscillatorParameters().plant
 CUBIC = OscillatorParameters(geometry="cubic").plant
 LINEAR = OscillatorParameters(geometry="linear").plant
+WAVES = {"force_amplitude": 0.3, "ripple_amplitude": 0.2, "ripple_frequency": 1.5, "stiffness_amplitude": 0.2}
 PLANTS = {"exact": EXACT, "cubic": CUBIC, "linear": LINEAR}
 
 
@@ -371,3 +372,24 @@ def test_a_step_does_not_leap_over_a_sharp_friction_layer():
     )
     assert end[4] == kernel.OK
     assert end[1] == pytest.approx(9.929318769, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("values", "rounding"),
+    [
+        # Each law once; exp and cos of numba and those of libm may differ in the last bit.
+        ({"geometry": "duffing", "kappa": 0.6, "friction": "hyperbolic"}, 0.0),
+        ({"alpha": 0.0, "friction": "coulomb", "mu_s": 1.5}, 0.0),
+        ({"geometry": "cubic", "friction": "gaussian"}, 1e-13),
+        ({"friction": "exponential", "mu_v": 0.01, **WAVES}, 1e-13),
+        pytest.param({"alpha": 0.0, **WAVES}, 1e-13, marks=pytest.mark.slow),
+        pytest.param({"friction": "coulomb"}, 0.0, marks=pytest.mark.slow),
+        pytest.param({"geometry": "linear", **WAVES}, 1e-13, marks=pytest.mark.slow),
+    ],
+)
+def test_each_law_gives_the_same_bits_compiled_and_interpreted(values, rounding):
+    parameters = OscillatorParameters(**values)
+    interpreted = getattr(kernel.advance, "py_func", kernel.advance)
+    for x, v in ((0.3, 0.1), (0.0, parameters.first_belt_speed), (-1.1, -0.4)):
+        case = parameters.plant, kernel.State(x, v), kernel.Drive(0.2, 0.02, 0.01), 6.0, None
+        assert kernel.advance(*case) == pytest.approx(interpreted(*case), rel=rounding, abs=rounding)

@@ -26,6 +26,17 @@ from sd_friction_env import (
 )
 from sd_friction_env.physics.laws import Coulomb, Exponential, Gaussian, Hyperbolic, Stribeck
 
+pytestmark = pytest.mark.usefixtures("either_way")
+
+
+def each_way(laws, compiled):
+    """Run a test with each law interpreted, with one of them compiled, too, and in the slow tests with all."""
+    ways = [("interpreted", law) for law in laws]
+    ways += [
+        pytest.param("compiled", law, marks=() if i == compiled else pytest.mark.slow) for i, law in enumerate(laws)
+    ]
+    return pytest.mark.parametrize(("either_way", "law"), ways, indirect=["either_way"])
+
 
 @friction_law
 class OwnStribeck(NamedTuple):
@@ -93,18 +104,21 @@ def episode(env, seed, steps=40):
 # A user's own law -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("either_way", ["compiled"], indirect=True)
+def test_an_environment_with_a_users_law_gives_the_bits_of_the_same_law_built_in():
+    own, built_in = (gym.make("SDFriction/Force-v0", parameters=p) for p in (OWN, NOMINAL))
+    assert episode(own, 3) == episode(built_in, 3)
+
+
 def test_a_users_law_gives_the_bits_of_the_same_law_built_in():
     assert limit_cycle(OWN).amplitude == limit_cycle(NOMINAL).amplitude
     ours, theirs = (simulate(p, x=0.6, v=0.0, t_end=30.0, dt=0.1) for p in (OWN, NOMINAL))
     assert ours.x.tobytes() == theirs.x.tobytes()
     assert ours.energy.contact == theirs.energy.contact
-    own, built_in = (gym.make("SDFriction/Force-v0", parameters=p) for p in (OWN, NOMINAL))
-    assert episode(own, 3) == episode(built_in, 3)
     own, built_in = (gym.make_vec("SDFriction/BeltSpeed-v0", 20, parameters=p) for p in (OWN, NOMINAL))
     assert episode(own, 4) == episode(built_in, 4)
 
 
-@pytest.mark.slow
 def test_a_users_spring_gives_the_bits_of_the_same_spring_built_in():
     own, built_in = OscillatorParameters(geometry=OwnLinear(1.0)), OscillatorParameters(geometry="linear")
     states = [
@@ -393,9 +407,9 @@ def test_a_batch_of_several_laws_is_the_single_environments_bit_for_bit():
             break
 
 
-@pytest.mark.parametrize("law", [law for law in LAWS if law], ids=str)
+@each_way([law for law in LAWS if law], compiled=1)
 def test_lanes_of_each_law_give_the_bits_of_single_environments(law):
-    n = 40
+    n = 24
     envs = gym.make_vec("SDFriction/Force-v0", n, parameters=law, start="random", force_limit=0.3)
     arguments = {"parameters": law, "start": "random", "force_limit": 0.3}
     singles = [gym.make("SDFriction/Force-v0", **arguments).unwrapped for _ in range(4)]
@@ -404,7 +418,7 @@ def test_lanes_of_each_law_give_the_bits_of_single_environments(law):
         assert (env.reset(seed=21 + i)[0] == observations[i]).all()
     rng = np.random.default_rng(5)
     over = np.zeros(4, bool)
-    for _ in range(150):
+    for _ in range(100):
         actions = rng.uniform(-1.0, 1.0, (n, 1)).astype(np.float32)
         observations, rewards, *_ = envs.step(actions)
         for i, env in enumerate(singles):
@@ -435,7 +449,6 @@ class OwnCoulomb(NamedTuple):
         return 0.0
 
 
-@pytest.mark.slow
 def test_numbers_of_one_users_law_are_not_taken_for_those_of_another():
     laws = [OwnCoulomb(0.4, 0.3), OwnStribeck(0.3, 0.2, 0.1), OWN.friction, "coulomb", OwnCoulomb(0.2, 0.1)]
     per_env = [{"parameters": {"friction": law}} for law in laws]
@@ -493,11 +506,13 @@ SHARP = [
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # interpreted: trial steps across a layer that are refused
-@pytest.mark.parametrize("law", SHARP, ids=str)
+@each_way(SHARP, compiled=0)
 @pytest.mark.parametrize("actuator", ["Force", "BeltSpeed"])
-def test_lanes_next_to_a_layer_and_to_a_switch_of_the_field_give_the_bits_of_single_environments(law, actuator):
+def test_lanes_next_to_a_layer_and_to_a_switch_of_the_field_give_the_bits_of_single_environments(
+    law, actuator, either_way
+):
     rng = np.random.default_rng(8)
-    n = 120
+    n = 120 if either_way == "compiled" else 24
     x = np.concatenate((rng.uniform(-0.12, 0.12, n - 4), [0.0, 0.0, 0.0, 1e-15]))
     belts = 0.2 + np.array([0.0, 1e-9, -1e-9, 1e-4, -1e-4, 1e-3, -1e-3, 0.02, -0.02, 0.8, -0.8, -1.4])
     v = belts[np.arange(n) % len(belts)]

@@ -198,8 +198,8 @@ print(json.dumps(amplitudes))
 def test_siconos_tends_to_our_amplitude_on_the_linear_belt_as_its_step_shrinks():
     for name in ("python3", "/usr/bin/python3"):
         python = shutil.which(name)
-        probe = [python, "-c", "import siconos.kernel"]
-        if python and subprocess.run(probe, check=False, capture_output=True, timeout=60).returncode == 0:
+        probe = ["-c", "import siconos.kernel"]
+        if python and subprocess.run([python, *probe], check=False, capture_output=True, timeout=60).returncode == 0:
             break
     else:
         pytest.skip("Siconos is not installed (Debian's python3-siconos)")

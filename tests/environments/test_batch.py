@@ -289,7 +289,7 @@ def mixed_steps(total, seed, geometries):
 
 
 def test_batch_and_single_environments_agree_over_mixed_steps():
-    done, events = mixed_steps(40_000, 0, ["exact", "exact", "linear"])
+    done, events = mixed_steps(50_000, 0, ["exact", "exact", "linear"])
     assert events > 1000
 
 

@@ -21,6 +21,7 @@ from scripts.figures import common, paper
 from sd_friction_env import OscillatorParameters, SDFrictionEnv, Table, limit_cycle, simulate
 from sd_friction_env.control.policies import Policy, ZeroPolicy
 from sd_friction_env.environments.ids import environment_id
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import classical, evaluation, training
 from sd_friction_env.learning.plan import make_plan
 from sd_friction_env.physics.simulation import Trajectory, amplitude
@@ -70,7 +71,7 @@ def heading(text: str) -> None:
 
 def closed_loop_amplitude(policy: Policy, env_id: str, belt_speed: float) -> float:
     """Return the amplitude over the last quarter of an episode at another nominal belt speed than trained for."""
-    env = evaluation.make_env(env_id)
+    env = make_env(env_id)
     start = {"parameters": {"belt_speed": belt_speed}}
     observation, _ = env.reset(seed=0, options=start)
     low, high, state = np.inf, -np.inf, None
@@ -185,7 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             points[f"PPO by {task}"] = (SWEPT_BELT_SPEEDS.tolist(), amplitudes)
         paper.draw_3(table, out / "figure_3_controlled.png", {"exact": points}, OscillatorParameters().belt_speed)
         histories = {f"control by {task}": switched_on(learned[task], env_id) for task, env_id in TASKS.items()}
-        when = SWITCH_ON * evaluation.make_env(TASKS["force"]).task.control_interval
+        when = SWITCH_ON * make_env(TASKS["force"]).task.control_interval
         figure = draw_before_and_after(histories, when, "Before and after control is switched on")
         plotting.save_figure(figure, out / "before_and_after.png")
     except OSError as error:

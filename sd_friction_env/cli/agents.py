@@ -13,8 +13,9 @@ from sd_friction_env.control.policies import (
     ZeroPolicy,
     load_policy,
 )
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.extras import extra
-from sd_friction_env.learning import classical, evaluation, runs
+from sd_friction_env.learning import classical, runs
 from sd_friction_env.learning.controllers import MADE_FROM_ENV, imported_policy
 
 # On force near the best there is. On belt the belt follows the mass, which makes matters worse at any gain.
@@ -37,18 +38,18 @@ def stored_agent(path: Path) -> tuple[NetworkPolicy, dict[str, Any] | None]:
 
 def check_fit(path: Path, policy: NetworkPolicy, env_id: str, env_kwargs: dict[str, Any]) -> None:
     """Check that an agent fits an environment."""
-    env = evaluation.make_env(env_id, env_kwargs)
+    env = make_env(env_id, env_kwargs)
     size = env.observation_space.shape[0] if env.observation_space.shape else 0
     if policy.observation_size != size:
         raise UsageError(f"{str(path)!r} observes {policy.observation_size} values, and {env_id} gives {size}")
     trained = policy.metadata.get("env_id")
-    if trained in ENVIRONMENT_IDS and evaluation.make_env(trained).task.actuator != env.task.actuator:
+    if trained in ENVIRONMENT_IDS and make_env(trained).task.actuator != env.task.actuator:
         raise UsageError(f"{str(path)!r} was trained on {trained}, whose actuator is not that of {env_id}")
 
 
 def velocity_feedback(env_id: str, env_kwargs: dict[str, Any], gain: float | None) -> tuple[VelocityFeedback, float]:
     """Return velocity feedback for an environment, and its gain (None: the default of the actuator)."""
-    env = evaluation.make_env(env_id, env_kwargs)
+    env = make_env(env_id, env_kwargs)
     used = VELOCITY_GAINS[env.task.actuator] if gain is None else gain
     return VelocityFeedback.from_env(env, used), used
 
@@ -68,14 +69,14 @@ def agent_of(name: str, env_id: str, *, gain: float | None = None, env_kwargs: d
     if name == "velocity-feedback":
         return velocity_feedback(env_id, env_kwargs or {}, gain)[0]
     if name in MADE_FROM_ENV:
-        return MADE_FROM_ENV[name](evaluation.make_env(env_id, env_kwargs))
+        return MADE_FROM_ENV[name](make_env(env_id, env_kwargs))
     path = Path(name)
     if path.suffix.lower() == ".onnx":
         with extra("export"):
             from sd_friction_env.learning import export
-        return export.ExportedPolicy.load(path, evaluation.make_env(env_id, env_kwargs))
+        return export.ExportedPolicy.load(path, make_env(env_id, env_kwargs))
     if ":" in name and not path.exists():
-        return imported_policy(name, evaluation.make_env(env_id, env_kwargs))
+        return imported_policy(name, make_env(env_id, env_kwargs))
     if path.suffix.lower() != ".npz" and not path.is_dir():
         raise UsageError(f"the agent must be {AGENTS_TEXT}, got {name!r}")
     policy, _ = stored_agent(path)

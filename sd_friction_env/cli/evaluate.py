@@ -26,6 +26,7 @@ from sd_friction_env.cli.options import (
     numbers,
 )
 from sd_friction_env.control.policies import ConstantPolicy, Policy, ZeroPolicy
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import classical, evaluation, grids
 from sd_friction_env.learning.controllers import MADE_FROM_ENV
 
@@ -86,7 +87,7 @@ def _controllers(
             policy, used = velocity_feedback(env_id, env_kwargs, gain)
             made[f"velocity feedback {used:g}"] = policy
         elif name in MADE_FROM_ENV:
-            env = evaluation.make_env(env_id, env_kwargs)
+            env = make_env(env_id, env_kwargs)
             made[f"{name.replace('-', ' ')}, default numbers"] = MADE_FROM_ENV[name](env)
     return made
 
@@ -128,7 +129,7 @@ def _evaluate(options: argparse.Namespace) -> int:
             beside = _controllers(options.controller, options.gain, env_id, env_kwargs)
             plants = None
             if options.plant_error is not None:
-                env = evaluation.make_env(env_id, env_kwargs)
+                env = make_env(env_id, env_kwargs)
                 plants = evaluation.plants_off_nominal(env, len(seeds), options.plant_error)
             passive = evaluation.passive_episodes(env_id, seeds, env_kwargs, plants)
             passive_table = evaluation.metrics(passive, passive)

@@ -19,8 +19,8 @@ from sd_friction_env.cli.options import (
     named_environment,
 )
 from sd_friction_env.control.policies import NetworkPolicy
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.extras import extra
-from sd_friction_env.learning import evaluation
 
 TEXT = """\
 The graph scales and clips the measurements and converts the action to a command; its metadata list the measurements and
@@ -68,7 +68,7 @@ def _export(options: argparse.Namespace) -> int:
     policy, env_id = _chosen(options)
     origin = {name: value for name, value in policy.metadata.items() if name != "fingerprint"}
     about = {"environment": env_id, "agent": str(options.agent or "pretrained"), "origin": origin}
-    model = export.build(policy, evaluation.make_env(env_id), about)
+    model = export.build(policy, make_env(env_id), about)
     measurements = export.trial_measurements(policy, env_id, options.trials, options.seed)
     worst = export.worst_difference(model, policy, env_id, measurements)
     astray = export.map_difference(env_id, min(options.trials, 10_000), options.seed)

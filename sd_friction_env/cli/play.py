@@ -20,7 +20,7 @@ from sd_friction_env.cli.options import (
 )
 from sd_friction_env.control import sound
 from sd_friction_env.environments.ids import TASKS, environment_id
-from sd_friction_env.learning import evaluation
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.physics import signals
 from sd_friction_env.physics.parameters import checked_number
 from sd_friction_env.pictures.scene import checked_size
@@ -129,11 +129,11 @@ def _listen(options: argparse.Namespace) -> int:
     pitch = sound.pitch_of(parameters, options.pitch)
     env_id = environment_id(options.task)
     seconds = checked_number("seconds", options.seconds, *sound.SECONDS)
-    steps = 2 + math.ceil(seconds / pitch.unit / evaluation.make_env(env_id).task.control_interval)
+    steps = 2 + math.ceil(seconds / pitch.unit / make_env(env_id).task.control_interval)
     env_kwargs = {"parameters": parameters, "episode_steps": max(steps, 1)}
     name = options.agent or ("threshold-follower" if options.task == "belt" else "velocity-feedback")
     policy = agent_of(name, env_id, gain=options.gain, env_kwargs=env_kwargs)
-    env = evaluation.make_env(env_id, env_kwargs)
+    env = make_env(env_id, env_kwargs)
     before, after = sound.squeal(env, policy, pitch, seconds=seconds, rate=options.rate)
     sound.write_sound(options.out, np.concatenate([before, after]), options.rate)
     heard = signals.harmonics(before, 1.0 / options.rate, count=1)["frequency"][0]

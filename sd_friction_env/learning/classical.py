@@ -41,6 +41,7 @@ from sd_friction_env.control.policies import (
 from sd_friction_env.control.policies.feedback import nearest_equilibrium
 from sd_friction_env.environments.ids import bare_id
 from sd_friction_env.environments.jacobian import step_with_jacobian
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.versions import versions
 from sd_friction_env.physics.parameters import OscillatorParameters
@@ -267,7 +268,7 @@ KINDS: dict[str, Kind] = {
 
 def kinds_for(env_id: str) -> list[str]:
     """Return the names of the controllers that are for an environment's sensor and actuator."""
-    env = evaluation.make_env(env_id)
+    env = make_env(env_id)
     return [name for name, kind in KINDS.items() if kind.fits(env)]
 
 
@@ -323,7 +324,7 @@ def lqr_gains(
 
 @functools.cache
 def _nominal_env(env_id: str) -> SDFrictionEnv:
-    return evaluation.make_env(env_id)
+    return make_env(env_id)
 
 
 def build(name: str, env_id: str, values: Sequence[float]) -> Policy:

@@ -30,6 +30,7 @@ from sd_friction_env.control.policies import (
 )
 from sd_friction_env.control.pretrained import load_pretrained, recurrent_follower
 from sd_friction_env.environments.ids import environment_id
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.optimal import OptimalPolicy
 
@@ -130,7 +131,7 @@ def check_teacher(name: str, env_id: str, env_kwargs: dict[str, Any]) -> None:
     Raises:
         ValueError: naming the controller and what is wrong.
     """
-    env = evaluation.make_env(env_id, env_kwargs)
+    env = make_env(env_id, env_kwargs)
     try:
         seen = np.repeat(env.reset(seed=evaluation.VALIDATION_SEEDS[0])[0][None], 2, axis=0)
         taught(teacher_of(name, env), seen, None, np.ones(2, bool))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sd_friction_env import SDFrictionEnv, SDFrictionVectorEnv, Table
 from sd_friction_env.control.policies import Policy, State, ZeroPolicy
-from sd_friction_env.environments.single import make_env as make_env
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import optimal
 from sd_friction_env.learning.scores import NO_INTERVAL, RESAMPLES, credited_score, score, score_interval
 from sd_friction_env.physics.parameters import checked_number

@@ -21,7 +21,7 @@ import sd_friction_env
 from sd_friction_env import SDFrictionEnv
 from sd_friction_env.control.policies import Actions, NetworkPolicy, State
 from sd_friction_env.control.policies.policy import broadcast_starts
-from sd_friction_env.learning import evaluation
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.storage import atomic_file
 
 OPSET = 17
@@ -242,7 +242,7 @@ class ExportedPolicy:
 def trial_measurements(policy: NetworkPolicy, env_id: str, n: int, seed: int = 0) -> Measurements:
     """Return windows of measurements, shape (n, frames, k): half from episodes that the agent controls, with their
     partly filled first windows, half random over more than the range of an observation."""
-    env = evaluation.make_env(env_id)
+    env = make_env(env_id)
     interface, rng = Interface.of(env), np.random.default_rng(seed)
     k, frames = len(interface.names), policy.frames
     driven: list[Measurements] = []
@@ -266,7 +266,7 @@ def trial_measurements(policy: NetworkPolicy, env_id: str, n: int, seed: int = 0
 
 def worst_difference(model: onnx.ModelProto, policy: NetworkPolicy, env_id: str, measurements: Measurements) -> float:
     """Return the largest difference between the model's actions and the agent's on the observations of measurements."""
-    interface = Interface.of(evaluation.make_env(env_id))
+    interface = Interface.of(make_env(env_id))
     (actions,) = session(model).run([ACTION], {MEASUREMENTS: measurements})
     windows = interface.observe(measurements)
     state = None
@@ -282,8 +282,8 @@ def map_difference(env_id: str, n: int, seed: int = 0) -> float:
     The sensor's noise and delay are left out: they belong to the plant, not to the map. Measurements do not use the
     environment's observations, so that an error of the map cannot cancel.
     """
-    interface = Interface.of(evaluation.make_env(env_id))
-    env = evaluation.make_env(env_id, {"sensor_noise": 0.0, "sensor_delay": 0})
+    interface = Interface.of(make_env(env_id))
+    env = make_env(env_id, {"sensor_noise": 0.0, "sensor_delay": 0})
     by_force, rng, worst, left = env.task.actuator == "force", np.random.default_rng(seed), 0.0, n
     episodes = max(1, min(20, n))  # each with another plant, where they are drawn
     for episode in range(episodes):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sd_friction_env.control.policies import Policy, ZeroPolicy
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation
 from sd_friction_env.physics.sweeps import Columns, Engine, run_chunks
 from sd_friction_env.physics.tables import Table
@@ -47,7 +48,7 @@ def evaluation_grid(
         raise ValueError(f"over must name parameters with at least one value each, got {dict(over)!r}")
     if plants_a_chunk != int(plants_a_chunk) or plants_a_chunk < 1:
         raise ValueError(f"plants_a_chunk must be a whole number from 1 on, got {plants_a_chunk!r}")
-    nominal = evaluation.make_env(env_id).nominal
+    nominal = make_env(env_id).nominal
     points = [tuple(float(value) for value in point) for point in itertools.product(*over.values())]
     for point in points:
         nominal.replace(**dict(zip(over, point, strict=True)))
@@ -69,7 +70,7 @@ def evaluation_grid(
 
 def _chunk(chunk: tuple[Policy, str, tuple[str, ...], list[tuple[float, ...]], list[int]]) -> Columns:
     policy, env_id, names, points, seeds = chunk
-    env = evaluation.make_env(env_id)
+    env = make_env(env_id)
     each = np.repeat(np.array(points), len(seeds), axis=0)
     options = {"parameters": evaluation.nominal_draws(env, len(each)) | dict(zip(names, each.T, strict=True))}
     episodes, passive = (

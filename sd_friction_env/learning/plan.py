@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sd_friction_env import ENVIRONMENT_IDS
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.controllers import check_teacher
 from sd_friction_env.learning.runs import CONFIG, RunFolderError
@@ -229,7 +230,7 @@ def _checked_environment(env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str
     except (TypeError, ValueError):
         raise ValueError(f"environment arguments must be plain finite values, got {env_kwargs!r}") from None
     try:
-        evaluation.make_env(env_id, kwargs).close()  # the environment checks its own arguments
+        make_env(env_id, kwargs).close()  # the environment checks its own arguments
     except (TypeError, ValueError) as error:
         reason = str(error).partition(" was raised from")[0]  # which Gymnasium adds
         raise ValueError(f"the environment refuses its arguments: {reason}") from None

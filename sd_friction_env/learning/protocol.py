@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from sd_friction_env import ENVIRONMENT_IDS, Table
 from sd_friction_env.control.policies import Actions, Policy, State
 from sd_friction_env.control.pretrained import changes_since, fingerprint
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.versions import versions
 from sd_friction_env.storage import StoredFileError, is_sealed, naming, read_json, write_json
@@ -85,7 +86,7 @@ class Checked:
 
 def decisions(env_id: str) -> int:
     """Return how often :func:`measure` calls a policy: in all episodes side by side, then in one alone."""
-    return evaluation.make_env(env_id).task.episode_steps + _TIMED + 1
+    return make_env(env_id).task.episode_steps + _TIMED + 1
 
 
 def measure(policy: Policy, name: str, env_id: str, progress: Callable[[], None] = lambda: None) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from sd_friction_env import SDFrictionVectorEnv
 from sd_friction_env.control.policies import RecurrentFollower, State, ThresholdFollower
 from sd_friction_env.environments.ids import ARGUMENTS
-from sd_friction_env.learning import evaluation
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning.plan import training_seed
 
 EPISODES = 256  # in each round
@@ -45,7 +45,7 @@ def train_follower(
         report: called after each round with its number from 1, the mean error and the episodes' mean return.
     """
     torch.manual_seed(seed)
-    env = evaluation.make_env(env_id)
+    env = make_env(env_id)
     unit, linear = nn.GRU(2, size), nn.Linear(size, 2)
     parameters = [*unit.parameters(), *linear.parameters()]
     optimiser = torch.optim.Adam(parameters, LEARNING_RATE)
@@ -93,7 +93,7 @@ def _episodes(policy: RecurrentFollower, env_id: str, seed: int, shown: float) -
 
     In a share ``shown`` of them the rule acts on the truth.
     """
-    steps = evaluation.make_env(env_id).task.episode_steps
+    steps = make_env(env_id).task.episode_steps
     arguments = {**ARGUMENTS[env_id], "episode_steps": steps + 1}  # no episode ends before the last step
     envs = SDFrictionVectorEnv(EPISODES, info_keys=("v",), **arguments)
     observation, info = envs.reset(seed=seed)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sd_friction_env.control.policies import State
-from sd_friction_env.learning import evaluation
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning.controllers import taught, teacher_of
 from sd_friction_env.learning.models import make_training_envs
 from sd_friction_env.learning.perceptrons import Perceptron
@@ -33,7 +33,7 @@ def warm_start(model: FastPPO, plan: Plan) -> None:
     """
     assert plan.start_from is not None
     settings = plan.hyperparameters["warm_start"]
-    teacher = teacher_of(plan.start_from, evaluation.make_env(plan.env_id, plan.env_kwargs))
+    teacher = teacher_of(plan.start_from, make_env(plan.env_id, plan.env_kwargs))
     n, size = settings["n_envs"], model.observation_space.shape[0] // plan.frames  # type: ignore[index]
     state: State = None
 

@@ -7,7 +7,8 @@ import scipy.linalg
 import scipy.signal
 
 from sd_friction_env.control.policies import Dither, Model, Readings, ScheduledFeedback, SoftBelt, SuperTwisting
-from sd_friction_env.learning import classical, evaluation
+from sd_friction_env.environments.single import make_env
+from sd_friction_env.learning import classical
 
 FORCE, BELT, RANDOMISED = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0", "SDFriction/BeltSpeedRandomised-v0"
 
@@ -107,7 +108,7 @@ def test_dither_is_a_cosine_from_the_start_of_each_episode_whatever_is_seen():
 @pytest.mark.parametrize("env_id", [RANDOMISED, "SDFriction/ForceRandomised-v0"])
 def test_scheduled_gains_are_the_regulators_of_the_belt_speed_at_which_the_mass_stuck(env_id):
     """The regulator by a Riccati iteration on differences of the plant's own step."""
-    env = evaluation.make_env(env_id)
+    env = make_env(env_id)
     policy = classical.build("LQR, gains scheduled by belt speed", env_id, (0.5, -0.3))
     speed = policy.belt_speeds[6]
     plant = env.nominal.replace(belt_speed=speed)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from sd_friction_env.control.policies import Model, RolloutPolicy, ThresholdFollower, rollout_follower
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation
 
 BELT, SENSED = "SDFriction/BeltSpeed-v0", "SDFriction/BeltSpeedSensed-v0"
@@ -52,9 +53,9 @@ def test_the_first_action_with_the_greatest_return_is_taken(env):
 
 @pytest.mark.parametrize(("env_id", "least"), [(BELT, 3.0), (SENSED, 2.0)])
 def test_it_suppresses_and_gains_on_the_rule_it_looks_ahead_with(env_id, least):
-    made = evaluation.make_env(env_id)
+    made = make_env(env_id)
     table = evaluation.evaluate(rollout_follower(made), env_id, STARTS)
-    rule = evaluation.evaluate(ThresholdFollower.from_env(evaluation.make_env(BELT)), BELT, STARTS)
+    rule = evaluation.evaluate(ThresholdFollower.from_env(make_env(BELT)), BELT, STARTS)
     assert table["suppressed"].all()
     assert table["return"].mean() > rule["return"].mean() + least
 

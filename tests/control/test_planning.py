@@ -17,6 +17,7 @@ from sd_friction_env.control.policies import (
     ThresholdFollower,
 )
 from sd_friction_env.control.shooting import descend, rollout
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.optimal import OptimalPolicy
 
@@ -108,7 +109,7 @@ def test_a_descent_is_never_worse_stays_in_bounds_and_returns_what_it_says():
 )
 def test_planning_gains_on_its_base_controller(env_id, kind, arguments, least):
     short = {"episode_steps": 110}
-    policy = kind.from_env(evaluation.make_env(env_id), **arguments)
+    policy = kind.from_env(make_env(env_id), **arguments)
     gain = [evaluation.evaluate(one, env_id, STARTS, short)["return"].mean() for one in (policy, policy.base)]
     assert gain[0] > gain[1] + least
 
@@ -160,7 +161,7 @@ def test_a_value_two_steps_ahead_finds_the_best_pair_of_actions():
 
 @pytest.mark.parametrize(("env_id", "least"), [(BELT, 3.5), (FORCE, 1.0)])
 def test_the_value_look_ahead_suppresses_and_leaves_rest_to_its_base_controller(env_id, least):
-    env, short = evaluation.make_env(env_id), {"episode_steps": 250}
+    env, short = make_env(env_id), {"episode_steps": 250}
     policy = OptimalPolicy.from_env(env)
     table = evaluation.evaluate(policy, env_id, STARTS, short)
     assert table["suppressed"].all()
@@ -210,7 +211,7 @@ def test_evaluate_prints_the_time_of_a_decision_and_plants_off_nominal(tmp_path,
     out = capsys.readouterr().out
     assert "plants 10% off nominal, 8 episodes" in out
     assert out.splitlines()[2].endswith("   ms")
-    plants = evaluation.plants_off_nominal(evaluation.make_env(BELT), 8, 0.1)["parameters"]
+    plants = evaluation.plants_off_nominal(make_env(BELT), 8, 0.1)["parameters"]
     assert {tuple(np.round(row, 6)) for row in np.column_stack(list(plants.values()))} == {
         (alpha, mu_m, v_b) for alpha in (0.72, 0.88) for mu_m in (0.045, 0.055) for v_b in (0.18, 0.22)
     }

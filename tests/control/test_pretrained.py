@@ -13,6 +13,7 @@ from sd_friction_env import load_pretrained
 from sd_friction_env.control import pretrained
 from sd_friction_env.control.policies import PolicyFileError, load_policy
 from sd_friction_env.environments.ids import SOLVED_IDS
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation, runs
 
 
@@ -45,7 +46,7 @@ def test_every_kept_run_was_trained_on_the_environment_as_it_is_now():
     assert folders
     for folder in folders:
         config = runs.load_config(folder)
-        env = evaluation.make_env(config["environment"]["id"], config["environment"]["kwargs"])
+        env = make_env(config["environment"]["id"], config["environment"]["kwargs"])
         space = runs.describe_space(env.observation_space)
         frames = config["environment"]["frame_stack"]
         assert [size * frames for size in space["shape"]] == config["spaces"]["observation"]["shape"]

@@ -8,7 +8,7 @@ from sd_friction_env import OscillatorParameters, limit_cycle, simulate
 from sd_friction_env.cli.main import main
 from sd_friction_env.control import sound
 from sd_friction_env.control.policies import ConstantPolicy, ZeroPolicy, threshold_follower
-from sd_friction_env.learning import evaluation
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.physics import signals
 from sd_friction_env.physics.orbits import OrbitError
 
@@ -48,7 +48,7 @@ def test_the_file_has_the_pitch_of_the_limit_cycle_and_control_silences_it(argum
 )
 def test_the_written_sound_of_every_plant_has_its_pitch(plant, tmp_path):
     pitch, path, rate = sound.pitch_of(plant), tmp_path / "squeal.wav", 22_050
-    env = evaluation.make_env(BELT, {"parameters": plant, "episode_steps": 100_000})
+    env = make_env(BELT, {"parameters": plant, "episode_steps": 100_000})
     sound.write_sound(path, sound.squeal(env, ZeroPolicy(), pitch, seconds=0.15, rate=rate)[0], rate)
     samples = wavfile.read(path)[1].astype(float)
     assert signals.harmonics(samples, 1.0 / rate, count=1)["frequency"][0] == pytest.approx(pitch.played, rel=1e-3)
@@ -65,14 +65,14 @@ def test_a_rig_is_played_at_its_own_frequency_if_that_is_audible():
 
 def test_without_control_the_second_part_sounds_as_the_first():
     pitch = sound.pitch_of(OscillatorParameters())
-    env = evaluation.make_env(BELT, {"episode_steps": 10_000})
+    env = make_env(BELT, {"episode_steps": 10_000})
     before, after = sound.squeal(env, ZeroPolicy(), pitch, seconds=0.1, rate=16_000)
     assert np.std(after) == pytest.approx(np.std(before), rel=0.01)
     assert signals.harmonics(after, 1 / 16_000, count=1)["frequency"][0] == pytest.approx(440.0, rel=1e-3)
 
 
 def test_the_sound_under_control_is_the_motion_on_the_belt_as_it_moves():
-    env, plant, dt = evaluation.make_env(BELT), OscillatorParameters(), 0.0125
+    env, plant, dt = make_env(BELT), OscillatorParameters(), 0.0125
     times, velocities = sound._controlled(env, ConstantPolicy(1.0), (0.7, 0.1), 3.0, dt)
     accelerations = np.zeros(40)
     accelerations[:2] = 0.5  # from 0.2 to 0.3, at the belt's greatest acceleration
@@ -87,7 +87,7 @@ def test_what_cannot_be_heard_is_refused(tmp_path):
         sound.pitch_of(OscillatorParameters(belt_speed=0.6))
     with pytest.raises(ValueError, match=r"pitch must be .* got 5"):
         sound.pitch_of(OscillatorParameters(), 5.0)
-    env = evaluation.make_env(BELT)
+    env = make_env(BELT)
     pitch = sound.pitch_of(OscillatorParameters())
     with pytest.raises(ValueError, match=r"episode_steps must be at least .* got 500"):
         sound.squeal(env, threshold_follower(env), pitch)

@@ -19,6 +19,7 @@ from sd_friction_env import equilibria, storage
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import ConstantPolicy, LinearFeedback, VelocityFeedback
 from sd_friction_env.environments.ids import SOLVED_IDS
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import classical, evaluation, scores
 from sd_friction_env.physics import theory
 
@@ -70,7 +71,7 @@ def test_velocity_feedback_stabilises_from_the_theoretical_gain_on(parameters):
 
 @pytest.mark.parametrize("env_id", [FORCE, BELT])
 def test_the_linearised_step_is_that_of_the_theory(env_id):
-    env = evaluation.make_env(env_id)
+    env = make_env(env_id)
     a, b = classical.linearised(env)
     eigenvalues = np.exp(np.array(equilibria(env.nominal)[-1].eigenvalues) * env.task.control_interval)
     found = np.linalg.eigvals(a[:2, :2])
@@ -86,17 +87,15 @@ def test_the_linearised_step_is_that_of_the_theory(env_id):
 
 @pytest.mark.parametrize(("nominal", "randomised"), [(FORCE, "ForceRandomised"), (BELT, "BeltSpeedRandomised")])
 def test_the_linearised_plant_is_the_nominal_one_also_where_episodes_draw_theirs(nominal, randomised):
-    expected = classical.linearised(evaluation.make_env(nominal))
-    for found, wanted in zip(
-        classical.linearised(evaluation.make_env(f"SDFriction/{randomised}-v0")), expected, strict=True
-    ):
+    expected = classical.linearised(make_env(nominal))
+    for found, wanted in zip(classical.linearised(make_env(f"SDFriction/{randomised}-v0")), expected, strict=True):
         assert np.array_equal(found, wanted)
 
 
 @pytest.mark.parametrize("env_id", [FORCE, BELT])
 @pytest.mark.parametrize("weights", [(0.0, 1.0), (10.0, 0.01), (0.0, 1000.0)])
 def test_lqr_is_stable_and_optimal_for_small_deviations(env_id, weights):
-    env = evaluation.make_env(env_id)
+    env = make_env(env_id)
     gains = classical.lqr_gains(env, *weights)
     assert closed_loop(env, gains) < 1.0
     a, b = classical.linearised(env)
@@ -121,7 +120,7 @@ def test_lqr_is_stable_and_optimal_for_small_deviations(env_id, weights):
 
 def test_lqr_needs_the_velocity():
     with pytest.raises(ValueError, match="LQR needs the velocity"):
-        classical.lqr_gains(evaluation.make_env("SDFriction/ForceSensed-v0"), 1.0, 1.0)
+        classical.lqr_gains(make_env("SDFriction/ForceSensed-v0"), 1.0, 1.0)
 
 
 @pytest.mark.parametrize("env_id", SOLVED_IDS)
@@ -166,7 +165,7 @@ def test_no_stored_gain_lies_where_the_search_ended():
 
 def test_the_bounds_are_wide_and_a_value_at_one_of_them_is_told():
     for env_id in SOLVED_IDS:
-        env = evaluation.make_env(env_id)
+        env = make_env(env_id)
         for name in classical.kinds_for(env_id):
             for way in classical.KINDS[name].ranges(env).values():
                 assert way.bound_at(way.low) == "low"

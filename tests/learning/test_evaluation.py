@@ -13,6 +13,7 @@ import scipy.stats
 from sd_friction_env import OscillatorParameters, Table, limit_cycle
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import ConstantPolicy, NetworkPolicy, VelocityFeedback, ZeroPolicy
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import classical, evaluation, optimal, scores
 from sd_friction_env.learning.evaluation import Episodes, evaluate, metrics, run_episodes, summarise
 from sd_friction_env.learning.scores import score
@@ -245,7 +246,7 @@ def test_the_passive_oscillator_is_the_limit_cycle():
 def test_velocity_feedback_suppresses_by_force_and_does_harm_by_belt():
     seeds = evaluation.VALIDATION_SEEDS[:4]
     for env_id in (FORCE, BELT):
-        policy = VelocityFeedback.from_env(evaluation.make_env(env_id), 1.5)
+        policy = VelocityFeedback.from_env(make_env(env_id), 1.5)
         table = evaluate(policy, env_id, seeds)
         assert table["suppressed"].all() == (env_id == FORCE)
         if env_id == BELT:
@@ -253,11 +254,11 @@ def test_velocity_feedback_suppresses_by_force_and_does_harm_by_belt():
 
 
 def test_episodes_are_those_of_an_environment_stepped_alone():
-    policy = VelocityFeedback.from_env(evaluation.make_env(BELT), 0.3)
+    policy = VelocityFeedback.from_env(make_env(BELT), 0.3)
     seeds = [7, 8]
     episodes = run_episodes(policy, BELT, seeds, {"episode_steps": 30})
     for i, seed in enumerate(seeds):
-        env = evaluation.make_env(BELT, {"episode_steps": 30})
+        env = make_env(BELT, {"episode_steps": 30})
         observation, info = env.reset(seed=seed)
         before = info["v_belt"]
         for t in range(30):

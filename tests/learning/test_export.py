@@ -17,6 +17,7 @@ from sd_friction_env import ENVIRONMENT_IDS
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import NetworkPolicy
 from sd_friction_env.control.pretrained import pretrained_file
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation, export
 
 RANDOMISED = "SDFriction/BeltSpeedRandomised-v0"
@@ -25,7 +26,7 @@ FORCE, BELT, SENSED = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0", "SDFrict
 
 def network(env_id, frames=1, activation="Tanh", output="clip"):
     rng = np.random.default_rng(5)
-    inputs = frames * evaluation.make_env(env_id).observation_space.shape[0]
+    inputs = frames * make_env(env_id).observation_space.shape[0]
     sizes = [inputs, 16, 8, 1]
     layers = [(rng.normal(size=(a, b)) / np.sqrt(a), 0.1 * rng.normal(size=b)) for a, b in itertools.pairwise(sizes)]
     return NetworkPolicy(tuple(layers), activation=activation, output=output, frames=frames)
@@ -35,13 +36,13 @@ def network(env_id, frames=1, activation="Tanh", output="clip"):
 @pytest.mark.parametrize(("frames", "activation", "output"), [(1, "Tanh", "clip"), (8, "ReLU", "tanh")])
 def test_the_model_acts_as_the_agent_on_ten_thousand_measurements(env_id, frames, activation, output):
     policy = network(env_id, frames, activation, output)
-    model = export.build(policy, evaluation.make_env(env_id))
+    model = export.build(policy, make_env(env_id))
     measurements = export.trial_measurements(policy, env_id, 10_000)
     assert measurements.shape == (10_000, frames, policy.observation_size)
     assert measurements.dtype == np.float32
     assert export.worst_difference(model, policy, env_id, measurements) < export.TOLERANCE
-    observations = export.Interface.of(evaluation.make_env(env_id)).observe(measurements)
-    limit = evaluation.make_env(env_id).task.observation_limit
+    observations = export.Interface.of(make_env(env_id)).observe(measurements)
+    limit = make_env(env_id).task.observation_limit
     assert (np.abs(observations) == limit).any()  # clipping is tried
     if frames > 1:
         # and young windows, zero but for what single precision makes of the measurements at rest
@@ -55,13 +56,13 @@ def test_measurements_and_commands_mean_what_the_environment_means_by_them(env_i
 
 @pytest.mark.parametrize("wrong", [{"offsets": (0.82, 0.0, 0.2), "scales": (0.39, 0.1, 0.1)}, {"command_scale": 0.1}])
 def test_a_wrong_map_is_noticed(wrong, monkeypatch):
-    right = export.Interface.of(evaluation.make_env(RANDOMISED))
+    right = export.Interface.of(make_env(RANDOMISED))
     monkeypatch.setattr(export.Interface, "of", lambda env: dataclasses.replace(right, **wrong))
     assert export.map_difference(RANDOMISED, 500) > 1e-3
 
 
 def test_where_the_plants_belt_speed_is_drawn_the_belt_is_told_relative_to_it():
-    model = export.build(network(RANDOMISED), evaluation.make_env(RANDOMISED))
+    model = export.build(network(RANDOMISED), make_env(RANDOMISED))
     said = {prop.key: prop.value for prop in model.metadata_props}
     assert json.loads(said["measurements"]) == ["x", "v", "v_belt/belt_speed"]
     assert said["command"] == "target of the belt's speed, over its nominal speed"
@@ -70,7 +71,7 @@ def test_where_the_plants_belt_speed_is_drawn_the_belt_is_told_relative_to_it():
 
 def test_a_wrong_model_is_noticed():
     policy, other = network(BELT), network(BELT, output="tanh")
-    model = export.build(policy, evaluation.make_env(BELT))
+    model = export.build(policy, make_env(BELT))
     measurements = export.trial_measurements(policy, BELT, 1000)
     assert export.worst_difference(model, other, BELT, measurements) > 1e-3
 
@@ -79,7 +80,7 @@ def test_a_wrong_model_is_noticed():
 def test_it_controls_from_what_is_measured_to_what_is_commanded(env_id):
     """Fed with the true state, it drives the environment as the agent does, and its command is what is applied."""
     policy = network(env_id, frames=3)
-    env, twin = evaluation.make_env(env_id), evaluation.make_env(env_id)
+    env, twin = make_env(env_id), make_env(env_id)
     model = export.build(policy, env)
     run = export.session(model).run
     said = {prop.key: prop.value for prop in model.metadata_props}
@@ -104,7 +105,7 @@ def test_it_controls_from_what_is_measured_to_what_is_commanded(env_id):
 
 
 def test_the_model_says_what_it_wants():
-    model = export.build(network(SENSED, 8), evaluation.make_env(SENSED), {"environment": SENSED})
+    model = export.build(network(SENSED, 8), make_env(SENSED), {"environment": SENSED})
     said = {prop.key: prop.value for prop in model.metadata_props}
     assert json.loads(said["measurements"]) == ["x"]
     assert said["environment"] == SENSED
@@ -120,7 +121,7 @@ def test_what_cannot_be_measured_or_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="shown parameters cannot be exported"):
         export.build(network(FORCE), shown)
     with pytest.raises(ValueError, match="the agent observes 2 values, and the environment gives 3"):
-        export.build(network(FORCE), evaluation.make_env(BELT))
+        export.build(network(FORCE), make_env(BELT))
 
 
 def test_the_script_writes_the_packages_agent_and_a_run(tmp_path, capsys):
@@ -192,7 +193,7 @@ def test_an_agent_of_another_task_is_refused(tmp_path, capsys):
 
 @pytest.mark.parametrize(("env_id", "frames"), [(BELT, 1), (SENSED, 8)])
 def test_a_file_acts_in_episodes_as_its_agent_does(env_id, frames, tmp_path):
-    policy, env = network(env_id, frames), evaluation.make_env(env_id)
+    policy, env = network(env_id, frames), make_env(env_id)
     export.write(export.build(policy, env), tmp_path / "agent.onnx")
     exported = export.ExportedPolicy.load(tmp_path / "agent.onnx", env)
     seeds = evaluation.VALIDATION_SEEDS[:3]
@@ -209,10 +210,10 @@ def test_a_file_acts_in_episodes_as_its_agent_does(env_id, frames, tmp_path):
 
 def test_a_file_is_refused_where_it_does_not_fit(tmp_path):
     path = tmp_path / "agent.onnx"
-    export.write(export.build(network(BELT), evaluation.make_env(BELT)), path)
+    export.write(export.build(network(BELT), make_env(BELT)), path)
     for env_id in (FORCE, SENSED, RANDOMISED):
         with pytest.raises(ValueError, match=r"agent\.onnx' is for x, v, v_belt, target of the belt's speed, and"):
-            export.ExportedPolicy.load(path, evaluation.make_env(env_id))
+            export.ExportedPolicy.load(path, make_env(env_id))
     path.write_bytes(b"no model")
     with pytest.raises(ValueError, match=r"agent\.onnx' is no agent of sd-friction export"):
-        export.ExportedPolicy.load(path, evaluation.make_env(BELT))
+        export.ExportedPolicy.load(path, make_env(BELT))

@@ -5,6 +5,7 @@ import pytest
 
 from sd_friction_env import OscillatorParameters, limit_cycle, load_pretrained
 from sd_friction_env.control.policies import EstimatingFollower, ThresholdFollower, ZeroPolicy
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation, off_nominal
 
 BELT = "SDFriction/BeltSpeed-v0"
@@ -35,7 +36,7 @@ class Sees:
 
 
 def test_each_controller_meets_each_plant_with_the_scales_of_the_nominal_one():
-    env = evaluation.make_env(BELT)
+    env = make_env(BELT)
     sees = Sees()
     policies = {"passive": ZeroPolicy(), "told": ThresholdFollower.from_env(env), "sees": sees}
     policies["not told"] = EstimatingFollower.from_env(env)
@@ -63,7 +64,7 @@ def test_each_controller_meets_each_plant_with_the_scales_of_the_nominal_one():
 
 def test_under_coulombs_law_only_the_damping_ends_the_vibration():
     # Its friction does not depend on the sliding speed: while the mass slips, the belt has no effect (docs/control.md).
-    env, seeds = evaluation.make_env(BELT), evaluation.VALIDATION_SEEDS[:20]
+    env, seeds = make_env(BELT), evaluation.VALIDATION_SEEDS[:20]
     options = {"parameters": off_nominal.PLANTS["Coulomb friction, 0.3 and 0.05"]}
     for policy in (EstimatingFollower.from_env(env), load_pretrained("SDFriction/BeltSpeedRandomised-v0")):
         for steps, share in ((500, 0.0), (1000, 1.0)):

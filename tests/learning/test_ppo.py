@@ -12,7 +12,8 @@ from stable_baselines3.common.logger import Logger
 from sd_friction_env import Table
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import ConstantPolicy, ThresholdFollower
-from sd_friction_env.learning import evaluation, models, runs, training, warm_start
+from sd_friction_env.environments.single import make_env
+from sd_friction_env.learning import models, runs, training, warm_start
 from sd_friction_env.learning.networks import network_policy
 from sd_friction_env.learning.plan import make_plan, plan_of
 from sd_friction_env.learning.ppo import FastPPO
@@ -160,7 +161,7 @@ def test_the_clone_acts_as_its_teacher_and_its_critic_knows_its_returns():
     with models.model_of(plan) as model:
         warm_start.warm_start(model, plan)
         clone = network_policy(model.policy)
-        env = evaluation.make_env(BELT)
+        env = make_env(BELT)
         rule = ThresholdFollower.from_env(env)
         rng = np.random.default_rng(1)
         envs = models.make_training_envs(BELT, {}, 16, 77)

@@ -9,6 +9,7 @@ import pytest
 from sd_friction_env import ENVIRONMENT_IDS
 from sd_friction_env.control.policies import ConstantPolicy, VelocityFeedback, ZeroPolicy
 from sd_friction_env.environments import ids
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation, protocol
 from sd_friction_env.learning.protocol import EntryError
 from sd_friction_env.storage import StoredFileError, read_json, write_json
@@ -17,7 +18,7 @@ FORCE, BELT, HIDDEN = "SDFriction/Force-v0", "SDFriction/BeltSpeed-v0", "SDFrict
 
 
 def feedback(env_id):
-    return VelocityFeedback.from_env(evaluation.make_env(env_id), 1.5)
+    return VelocityFeedback.from_env(make_env(env_id), 1.5)
 
 
 @pytest.fixture(scope="module")

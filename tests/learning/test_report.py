@@ -15,6 +15,7 @@ from sd_friction_env import OscillatorParameters, Table, limit_cycle
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import ConstantPolicy, NetworkPolicy, VelocityFeedback, ZeroPolicy
 from sd_friction_env.environments.ids import TASKS, TIERS, environment_id
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import classical, evaluation, optimal, report, runs
 from sd_friction_env.learning.report import ENV_IDS, QUICK, Effort, Replay, Report
 from sd_friction_env.learning.report.agents import LEARNING, by_algorithm
@@ -36,7 +37,7 @@ def make_run(folder, name, gain=-3.0, rows=((100, 1.0, -400.0, 0.0), (300, 3.0, 
         "steps": 300,
         "versions": {},
     }
-    size = evaluation.make_env(ENV_IDS[task, tier]).observation_space.shape[0]
+    size = make_env(ENV_IDS[task, tier]).observation_space.shape[0]
     weights = np.zeros((size, 1))
     weights[min(1, size - 1)] = gain
     partial = runs.begin(folder / name, config | changes)
@@ -146,7 +147,7 @@ def test_a_picture_shows_a_middling_run_and_not_the_best(tmp_path):
 
 
 def test_the_best_classical_controller_is_shown_and_what_is_missing_is_said(monkeypatch):
-    feedback = VelocityFeedback.from_env(evaluation.make_env(ENV_IDS["force", "nominal"]), 1.5)
+    feedback = VelocityFeedback.from_env(make_env(ENV_IDS["force", "nominal"]), 1.5)
     tuned = {"weak": VelocityFeedback(0.01, readings=feedback.readings), "good": feedback}
     known = evaluation.optimal_returns(ENV_IDS["force", "nominal"], evaluation.EVALUATION_SEEDS[:3])
     known[1] = np.nan
@@ -266,7 +267,7 @@ def test_scores_over_tasks_take_every_run_and_want_both_tasks():
 @pytest.mark.parametrize("sweep", report.SWEEPS)
 def test_a_sweep_moves_one_parameter_and_nothing_else(sweep):
     # The last controller sees the randomised tier, where nothing may be drawn.
-    feedback = VelocityFeedback.from_env(evaluation.make_env(ENV_IDS["force", "nominal"]), 1.5)
+    feedback = VelocityFeedback.from_env(make_env(ENV_IDS["force", "nominal"]), 1.5)
     policies = {
         "feedback": ("nominal", feedback),
         "nothing": ("nominal", ZeroPolicy()),
@@ -289,7 +290,7 @@ def test_a_sweep_moves_one_parameter_and_nothing_else(sweep):
 def test_a_history_is_the_episode_of_the_environment():
     env_id = ENV_IDS["belt", "nominal"]
     path = report.history(ConstantPolicy(0.3), env_id, 7)
-    env = evaluation.make_env(env_id)
+    env = make_env(env_id)
     env.reset(seed=7)
     for step in range(1, 501):
         *_, info = env.step(np.array([0.3], np.float32))
@@ -299,7 +300,7 @@ def test_a_history_is_the_episode_of_the_environment():
                 assert path[name][place] == pytest.approx(info[name], abs=1e-6)
     assert path["action"] == pytest.approx(0.3)
     # what is shown of feedback is held over each interval, and changes between them
-    feedback = VelocityFeedback.from_env(evaluation.make_env(ENV_IDS["force", "nominal"]), 1.0)
+    feedback = VelocityFeedback.from_env(make_env(ENV_IDS["force", "nominal"]), 1.0)
     path = report.history(feedback, ENV_IDS["force", "nominal"], 7)
     at = np.isclose(np.mod(path["t"] + 0.05, 0.1), 0.0, atol=1e-6) | np.isclose(
         np.mod(path["t"] + 0.05, 0.1), 0.1, atol=1e-6

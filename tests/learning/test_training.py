@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from sd_friction_env import ENVIRONMENT_IDS, Table, storage
 from sd_friction_env.cli.main import main
 from sd_friction_env.control.policies import load_policy
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.environments.wrappers import ScaledReward
 from sd_friction_env.learning import evaluation, models, networks, runs, settings, tensors, training
 from sd_friction_env.learning.plan import make_plan, training_seed
@@ -491,7 +492,7 @@ def test_training_seeds_are_no_evaluation_seeds_and_differ_between_runs():
 
 def test_training_environments_are_the_environment_itself():
     envs = models.make_training_envs(FORCE, {"episode_steps": 20}, 3, 5)
-    alone = [evaluation.make_env(FORCE, {"episode_steps": 20}) for _ in range(3)]
+    alone = [make_env(FORCE, {"episode_steps": 20}) for _ in range(3)]
     first = envs.reset()
     singles = [env.reset(seed=training_seed(5, i))[0] for i, env in enumerate(alone)]
     assert np.array_equal(first, singles)
@@ -533,7 +534,7 @@ def test_rewards_are_scaled_by_one_law_in_both_forms():
 def test_a_network_sees_the_same_frames_as_in_training():
     frames = 3
     env_id = "SDFriction/BeltSpeedSensed-v0"
-    envs = VecFrameStack(DummyVecEnv([lambda: evaluation.make_env(env_id, {"episode_steps": 7})] * 2), frames)
+    envs = VecFrameStack(DummyVecEnv([lambda: make_env(env_id, {"episode_steps": 7})] * 2), frames)
     policy = networks.build_policy("ppo", envs.observation_space, envs.action_space, {"net_arch": [8]})
     network = networks.network_policy(policy, frames)
     envs.seed(3)
@@ -551,7 +552,7 @@ def test_a_network_sees_the_same_frames_as_in_training():
 @pytest.mark.parametrize("net_arch", [[], [16], [32, 8, 8]])
 @pytest.mark.parametrize("activation", ["Tanh", "ReLU"])
 def test_the_numpy_actor_equals_the_torch_actor(algorithm, net_arch, activation, tmp_path):
-    space = evaluation.make_env(BELT)
+    space = make_env(BELT)
     arguments = {"net_arch": net_arch, "activation_fn": activation}
     torch.manual_seed(1)
     policy = networks.build_policy(algorithm, space.observation_space, space.action_space, arguments)

@@ -18,6 +18,7 @@ from optuna.trial import FixedTrial, TrialState
 
 from sd_friction_env import ENVIRONMENT_IDS, Table
 from sd_friction_env.cli.main import main
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation, runs, settings, training, tuning
 from sd_friction_env.learning.plan import make_plan
 from sd_friction_env.learning.tuning import trial
@@ -165,7 +166,7 @@ def test_an_episode_that_is_not_suppressed_counts_no_more_than_a_passive_one():
     passive = values(ZeroPolicy(), "SDFriction/BeltSpeed-v0")
     assert slow["mean_return"] > 0.9 * passive["mean_return"]
     assert slow["credited_return"] == pytest.approx(passive["mean_return"])
-    good = values(VelocityFeedback.from_env(evaluation.make_env(FORCE), 1.5), FORCE)
+    good = values(VelocityFeedback.from_env(make_env(FORCE), 1.5), FORCE)
     assert good["suppressed"] == 1.0
     assert good["credited_return"] == good["mean_return"]
 

@@ -2,7 +2,7 @@
 
 from sd_friction_env import OscillatorParameters, Table, load_pretrained, simulate
 from sd_friction_env.control.policies import LinearFeedback, SlidingMode
-from sd_friction_env.learning.evaluation import make_env
+from sd_friction_env.environments.single import make_env
 
 
 def test_a_table_prints_its_size_and_columns_in_one_line():

@@ -9,6 +9,7 @@ import scipy.stats
 
 from sd_friction_env import OscillatorParameters, Table, amplitude_curve, simulate
 from sd_friction_env.control.policies import Policy, State, ZeroPolicy
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation
 from sd_friction_env.learning.report.agents import ENV_IDS, Agent, Row, by_algorithm
 from sd_friction_env.learning.report.comparison import Effort
@@ -42,7 +43,7 @@ def sweep_plants(task: str, sweep: str, policies: Mapping[str, tuple[str, Policy
     seeds = np.tile(evaluation.EVALUATION_SEEDS[: effort.phases], len(values)).tolist()
 
     def episodes(policy: Policy, env_id: str) -> evaluation.Episodes:
-        env = evaluation.make_env(env_id)
+        env = make_env(env_id)
         options = {"parameters": evaluation.nominal_draws(env, len(each)) | swept_parameters(sweep, each, env.nominal)}
         return evaluation.run_episodes(policy, env_id, seeds, options=options)
 
@@ -51,7 +52,7 @@ def sweep_plants(task: str, sweep: str, policies: Mapping[str, tuple[str, Policy
         return [where | row for row in Table(columns).rows()]
 
     nominal_id = ENV_IDS[task, "nominal"]
-    nominal = evaluation.make_env(nominal_id).nominal
+    nominal = make_env(nominal_id).nominal
     fine = np.linspace(*SWEEPS[sweep][1:], 4 * effort.points - 3)
     plants = [nominal.replace(**swept_parameters(sweep, value, nominal)) for value in fine.tolist()]
     attractors = [amplitude_curve(plant, plant.belt_speed)["amplitude"][0] for plant in plants]
@@ -67,7 +68,7 @@ def sweep_plants(task: str, sweep: str, policies: Mapping[str, tuple[str, Policy
 
 def history(policy: Policy, env_id: str, seed: int) -> Table:
     """Return an episode of ``reset(seed=seed)`` sampled finely (t, x, v, v_belt, action)."""
-    env = evaluation.make_env(env_id)
+    env = make_env(env_id)
     observation, first = env.reset(seed=seed)
     parameters, hold = env.parameters, env.task.control_interval
     state: State = None

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sd_friction_env import Table
-from sd_friction_env.learning import evaluation
+from sd_friction_env.environments.single import make_env
 from sd_friction_env.pictures import plotting
 
 if TYPE_CHECKING:
@@ -61,8 +61,8 @@ def draw_scores(rows: Sequence[Row]) -> "Figure":
 def draw_sweeps(rows: Sequence[Row], task: str) -> "Figure":
     """Draw the settled amplitudes of all sweeps of a task."""
     figure, axes = plotting.new_figure(8.0, 3.0 * len(SWEEPS) + 1.2, len(SWEEPS), 1)
-    nominal = evaluation.make_env(ENV_IDS[task, "nominal"]).nominal
-    drawn = evaluation.make_env(ENV_IDS[task, "randomised"]).task.randomise
+    nominal = make_env(ENV_IDS[task, "nominal"]).nominal
+    drawn = make_env(ENV_IDS[task, "randomised"]).task.randomise
     here = {"belt_speed": nominal.belt_speed, "alpha": nominal.alpha, "friction_drop": nominal.mu_s - nominal.mu_m}
     low, high = drawn["mu_m"]
     ranges = {**drawn, "friction_drop": (nominal.mu_s - high, nominal.mu_s - low)}

@@ -6,16 +6,13 @@
     python scripts/check.py -k orbits -x        what is not an option of this script goes to pytest
     python scripts/check.py -n 0                tests in one process (default: one for each core)
 
-All checks run even when one fails; the exit status is 1 if any did. mypy, which takes longest, works beside the tests.
+All checks run even when one fails; the exit status is 1 if any did.
 """
 
 import argparse
-import contextlib
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -25,10 +22,10 @@ MEND = {
     "ruff check --fix": [PYTHON, "-m", "ruff", "check", "--fix", "."],
     "ruff format": [PYTHON, "-m", "ruff", "format", "."],
 }
-MYPY = [PYTHON, "-m", "mypy"]
 LINT = {
     "ruff check": [PYTHON, "-m", "ruff", "check", "."],
     "ruff format --check": [PYTHON, "-m", "ruff", "format", "--check", "."],
+    "mypy": [PYTHON, "-m", "mypy"],
     # Through the interpreter and not by its script, which lies in another folder on each system.
     "lint-imports": [
         PYTHON,
@@ -40,52 +37,13 @@ LINT = {
 
 def run(name: str, command: list[str]) -> bool:
     """Run one check under a heading and tell whether it passed."""
-    heading(name)
+    print(f"\n=== {name} ".ljust(80, "="), flush=True)
     start = time.perf_counter()
     passed = subprocess.run(command, cwd=ROOT, check=False).returncode == 0
     # pytest times itself, and its closing line stays the last one: CI reads it.
     if name != "pytest":
         print(f"--- {name}: {'ok' if passed else 'FAILED'} ({time.perf_counter() - start:.1f} s)", flush=True)
     return passed
-
-
-def heading(name: str) -> None:
-    """Print a line that begins the output of a check."""
-    print(f"\n=== {name} ".ljust(80, "="), flush=True)
-
-
-@contextlib.contextmanager
-def beside(name: str, command: list[str]) -> Iterator[Callable[[], bool]]:
-    """Start a check; yield a function that waits for it, prints what it said and tells whether it passed."""
-    with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
-        process = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
-
-        def finish() -> bool:
-            heading(name)
-            passed = process.wait() == 0
-            output.seek(0)
-            print(f"{output.read()}--- {name}: {'ok' if passed else 'FAILED'}", flush=True)
-            return passed
-
-        try:
-            yield finish
-        finally:
-            process.kill()
-            process.wait()
-
-
-def test(command: list[str], before_the_last_line: Callable[[], object]) -> bool:
-    """Show the tests while they run, but hold the last line back for the other checks' output."""
-    heading("pytest")
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, errors="replace") as process:
-        assert process.stdout is not None
-        held = ""
-        for line in process.stdout:
-            print(held, end="", flush=True)
-            held = line
-        before_the_last_line()
-        print(held, end="", flush=True)
-    return process.returncode == 0
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -102,27 +60,23 @@ def main(arguments: list[str] | None = None) -> int:
     if options.fix:
         for name, command in MEND.items():
             run(name, command)
-    failed = []
-    with beside("mypy", MYPY) as mypy:
+    failed = [name for name, command in LINT.items() if not run(name, command)]
 
-        def finish_mypy() -> None:
-            if not mypy():
-                failed.append("mypy")
-
-        failed += [name for name, command in LINT.items() if not run(name, command)]
-        pytest = [PYTHON, "-m", "pytest", *for_pytest]
-        # One process for each core, unless the arguments say how many, or stop where that would hide it.
-        if options.lint_only or any(given.startswith(("-n", "--numprocesses", "--pdb", "-s")) for given in for_pytest):
-            finish_mypy()
-            if not options.lint_only and not run("pytest", pytest):
-                failed.append("pytest")
-        # Each process begins with its own half: fewer functions are compiled by both.
-        elif not test([*pytest, "-n", "auto", "--dist", "worksteal"], finish_mypy):
-            failed.append("pytest")
+    print("\n=== summary ".ljust(80, "="))
+    for name in LINT:
+        print(f"{'FAILED' if name in failed else 'ok':>6}  {name}")
+    if options.lint_only:
+        return int(bool(failed))
+    print("  next  pytest", flush=True)
+    # One process for each core, unless the arguments say how many, or stop where a process of its own would hide it.
+    # Each begins with its own half of the tests: fewer functions are compiled by both.
+    alone = any(argument.startswith(("-n", "--numprocesses", "--pdb", "-s")) for argument in for_pytest)
+    if not run(
+        "pytest", [PYTHON, "-m", "pytest", *([] if alone else ["-n", "auto", "--dist", "worksteal"]), *for_pytest]
+    ):
+        failed.append("pytest")
     if failed:
         print(f"\nFAILED: {', '.join(failed)}", file=sys.stderr)
-    elif options.lint_only:
-        print("\nAll passed.")
     return int(bool(failed))
 
 

@@ -79,14 +79,16 @@ class ObservedRollout(ObservedRule):
     velocity and belt speed. The gain of an action is its mean over the guesses minus ``caution`` standard errors, so
     that the rule's own action is kept where the guesses do not agree on a better one.
 
-    The rule's gain is 2 / belt_authority unless another rule is given. A belt that follows so makes small vibration
-    decay as fast as it would grow by itself; of all gains it moves the belt least where noise excites that vibration.
+    The rule's gain is 2 / belt_authority unless another rule is given. To first order a gain k turns the growth rate s
+    of small vibration into s (1 - belt_authority k): here decay replaces growth at the same rate. With a constant
+    observer gain and white noise the action's variance is proportional to k^2 / (belt_authority k - 1), which is then
+    least.
 
     Attributes:
         guesses: that are tried, in [1, 1000]: at even shares of the weights.
         candidates: evenly spaced first actions beside the rule's own, in [2, 1000].
         horizon: control intervals that are looked ahead, in [1, 10000].
-        caution: in [0, 1000].
+        caution: standard errors by which another action must gain more than the rule's, in [0, 1000].
     """
 
     guesses: int = 24

@@ -32,7 +32,7 @@ from sd_friction_env.learning.plan import Plan, check_same, checked_freq
 from sd_friction_env.learning.ppo import FastPPO
 from sd_friction_env.learning.tensors import save_tensors
 from sd_friction_env.learning.versions import versions as versions_of
-from sd_friction_env.learning.warm_start import warm_start
+from sd_friction_env.learning.warm_start import clone, fit_critic
 
 Row = dict[str, Any]
 
@@ -205,8 +205,6 @@ class _Supervisor(BaseCallback):
         if self.noises:  # they have just been reset
             checkpoints.restore_noises(self.model, self.noises)
         self.next_evaluation = next_multiple(self.num_timesteps, self.plan.eval_freq)
-        if self.plan.start_from is not None and not self.num_timesteps:
-            self.next_evaluation = 0  # the clone: training may make it worse
         self.next_checkpoint = next_multiple(self.num_timesteps, self.checkpoint_freq)
         self.bar = tqdm(
             total=self.plan.steps,
@@ -218,6 +216,10 @@ class _Supervisor(BaseCallback):
             dynamic_ncols=True,
             mininterval=0.5,
         )
+        if isinstance(self.model, FastPPO) and self.plan.start_from is not None and not self.num_timesteps:
+            clone(self.model, self.plan)
+            self.evaluate()  # training may make it worse
+            fit_critic(self.model, self.plan)
 
     def _on_step(self) -> bool:
         log_episodes(self.locals["infos"], self.locals["dones"], self.logger)
@@ -373,8 +375,6 @@ def _learn(supervisor: _Supervisor, model: BaseAlgorithm, checkpoint: tuple[Path
     try:
         if checkpoint is not None:
             supervisor.restore(*checkpoint, logger)
-        elif isinstance(model, FastPPO) and plan.start_from is not None:
-            warm_start(model, plan)
         model.learn(
             plan.steps - (resumed_at or 0),
             callback=[*make_callbacks(plan.hyperparameters), supervisor],

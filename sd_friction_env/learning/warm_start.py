@@ -20,13 +20,12 @@ _SEEDS = 2**20  # the episodes of the clone are none of those that PPO trains on
 _TAIL = 5.0  # of the returns, in units of 1/(1 - gamma)
 
 
-def warm_start(model: FastPPO, plan: Plan) -> None:
-    """Start a model from the controller that its plan names; the numbers are its hyperparameter ``warm_start``.
+def clone(model: FastPPO, plan: Plan) -> None:
+    """Fit a model's actor to the controller that its plan names; the numbers are its hyperparameter ``warm_start``.
 
     The actor's mean is fitted to the controller's actions on states that it visits under exploration noise of 0 to
     ``noise``, and, where it has no memory and the agent sees one observation, on states scattered around these and
-    uniformly between them. The critic is fitted to the discounted returns of the agent so cloned, with its exploration
-    and without a time limit.
+    uniformly between them.
 
     Raises:
         ValueError: if the controller returns anything but actions in [-1, 1].
@@ -53,13 +52,18 @@ def warm_start(model: FastPPO, plan: Plan) -> None:
         actions = torch.from_numpy(taught(teacher, seen.numpy(), None, np.ones(len(seen), bool))[0])
     _fit(model, model.actor, seen, actions, settings["actor_steps"], settings)
 
-    def clone(seen: NDArray[np.float32], t: int) -> NDArray[np.float32]:
+
+def fit_critic(model: FastPPO, plan: Plan) -> None:
+    """Fit a model's critic to the discounted returns of its actor, with its exploration and without a time limit."""
+
+    def act(seen: NDArray[np.float32], t: int) -> NDArray[np.float32]:
         return model.actor.forward(torch.from_numpy(seen))[-1].numpy()
 
-    steps = settings["n_steps"]
+    settings = plan.hyperparameters["warm_start"]
+    n, steps = settings["n_envs"], settings["n_steps"]
     tail = int(_TAIL / max(1.0 - model.gamma, 1e-3))
     spread = torch.exp(model.policy.log_std.detach()).expand(n, 1)
-    seen, _, rewards, dones = _episodes(plan, steps + tail, clone, spread, episode_steps=steps + tail)
+    seen, _, rewards, dones = _episodes(plan, steps + tail, act, spread, episode_steps=steps + tail)
     returns = np.zeros((steps + tail + 1, n), np.float32)
     for t in reversed(range(steps + tail)):
         returns[t] = rewards[t] + model.gamma * (~dones[t]) * returns[t + 1]

@@ -159,7 +159,8 @@ def test_the_clone_acts_as_its_teacher_and_its_critic_knows_its_returns():
     """On states of other episodes, away from the rule's jump at the threshold, which no smooth network has."""
     plan = warm_plan()
     with models.model_of(plan) as model:
-        warm_start.warm_start(model, plan)
+        warm_start.clone(model, plan)
+        warm_start.fit_critic(model, plan)
         clone = network_policy(model.policy)
         env = make_env(BELT)
         rule = ThresholdFollower.from_env(env)
@@ -272,6 +273,6 @@ def test_what_cannot_start_from_a_controller_is_refused(arguments, message, tmp_
 def test_an_object_with_predict_can_be_the_teacher():
     plan = warm_plan(start_from=f"{__name__}:half", warm={"actor_steps": 300, "critic_steps": 1, "n_steps": 50})
     with models.model_of(plan) as model:
-        warm_start.warm_start(model, plan)
+        warm_start.clone(model, plan)
         seen = torch.randn(100, 3)
         assert float((model.actor.forward(seen)[-1] - 0.5).abs().mean()) < 0.1

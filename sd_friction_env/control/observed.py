@@ -1,6 +1,6 @@
 """Controllers that act on what an observer believes: the rule, its look-ahead, and trained networks."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -48,24 +48,53 @@ class ObservedPolicy:
 class ObservedRule(ObservedPolicy):
     """:class:`ThresholdFollower` at the believed mean velocity and nominal belt speed.
 
+    Where an estimated plant predicts the velocity, that has a steady error, which the rule would make a steady action.
+    The believed position has none, since it is read. While the rule is within its limits, a complementary filter
+    therefore takes the slow part of the velocity from the position's change::
+
+        bias += (mean v of the last interval - change of x / interval - bias) interval / blend_time
+        action = rule at v - bias
+
+    Source: Higgins, 1975 (complementary filter).
+
     Attributes:
         rule: its numbers; its belt speed is replaced by the believed one.
+        blend_time: time constant of the filter, in [1e-6, 1e9] (dimensionless, as all times); None: no filter.
+
+    Raises:
+        TypeError, ValueError: if ``blend_time`` is not as said.
     """
 
     rule: ThresholdFollower
+    blend_time: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.blend_time is not None:
+            object.__setattr__(self, "blend_time", checked_number("blend_time", self.blend_time, 1e-6, 1e9))
 
     @classmethod
     def from_env(cls, env: Any, observer: Observer, **named: Any) -> Self:
         """Return the controller of an environment with an observer; ``named`` are numbers of the class.
 
+        ``blend_time`` is 1.2 where an estimated plant predicts the velocity.
+
         Raises:
             ValueError: if the actuator is not the belt's speed or has no authority.
         """
-        return cls(observer, **({"rule": ThresholdFollower.seeing_all(env)} | named))
+        blend_time = 1.2 if observer.velocity_may_drift else None
+        return cls(observer, **({"rule": ThresholdFollower.seeing_all(env), "blend_time": blend_time} | named))
 
     def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
         states, parameters = belief.mean
-        return self._follow(states, parameters), None
+        now, belt_speed = states[..., :2], self.observer.belt_speed(parameters)
+        if self.blend_time is None:
+            return self.rule.follow(now[..., 1], belt_speed), None
+        bias, before = (np.zeros(belief.steps.shape), now) if state is None else state
+        interval, v = self.observer.ensemble.task.control_interval, now[..., 1]
+        error = 0.5 * (v + before[..., 1]) - (now[..., 0] - before[..., 0]) / interval
+        is_small = (belief.steps > 0) & (self.rule.gain * np.abs(v) < belt_speed)
+        bias = np.where(is_small, bias + (error - bias) * min(1.0, interval / self.blend_time), 0.0)
+        return self.rule.follow(v - bias, belt_speed), (bias, now)
 
     def _follow(self, states: _Floats, parameters: _Floats) -> _Floats:
         return self.rule.follow(states[..., 1], self.observer.belt_speed(parameters))
@@ -79,11 +108,6 @@ class ObservedRollout(ObservedRule):
     velocity and belt speed. The gain of an action is its mean over the guesses minus ``caution`` standard errors, so
     that the rule's own action is kept where the guesses do not agree on a better one.
 
-    The rule's gain is 2 / belt_authority unless another rule is given. To first order a gain k turns the growth rate s
-    of small vibration into s (1 - belt_authority k): here decay replaces growth at the same rate. With a constant
-    observer gain and white noise the action's variance is proportional to k^2 / (belt_authority k - 1), which is then
-    least.
-
     Attributes:
         guesses: that are tried, in [1, 1000]: at even shares of the weights.
         candidates: evenly spaced first actions beside the rule's own, in [2, 1000].
@@ -96,19 +120,15 @@ class ObservedRollout(ObservedRule):
     horizon: int = 100
     caution: float = 1.0
 
-    @classmethod
-    def from_env(cls, env: Any, observer: Observer, **named: Any) -> Self:
-        """Return the controller of an environment with an observer; see :meth:`ObservedRule.from_env`."""
-        rule = ThresholdFollower.seeing_all(env)
-        return super().from_env(env, observer, **({"rule": replace(rule, gain=2.0 / rule.belt_authority)} | named))
-
     def __post_init__(self) -> None:
+        super().__post_init__()
         object.__setattr__(self, "caution", checked_number("caution", self.caution, 0.0, 1000.0))
         for name, bounds in (("guesses", (1, 1000)), ("candidates", (2, 1000)), ("horizon", (1, 10_000))):
             object.__setattr__(self, name, checked_count(name, getattr(self, name), *bounds))
 
     def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
-        own = as_taken(super()._decide(belief, state, starts)[0])
+        own, state = super()._decide(belief, state, starts)
+        own = as_taken(own)
         first = np.empty((*own.shape, self.candidates + 1))
         first[..., 0], first[..., 1:] = own, np.linspace(-1.0, 1.0, self.candidates)
         shares = (np.arange(min(self.guesses, belief.weights.shape[-1])) + 0.5) / self.guesses
@@ -129,7 +149,7 @@ class ObservedRollout(ObservedRule):
         total = np.nan_to_num(total, nan=-1e9)
         gain = total - total[..., :1]
         error = gain.std(axis=-2) / np.sqrt(gain.shape[-2])
-        return pick(first, np.argmax(gain.mean(axis=-2) - self.caution * error, axis=-1)), None
+        return pick(first, np.argmax(gain.mean(axis=-2) - self.caution * error, axis=-1)), state
 
 
 @dataclass(frozen=True)

@@ -149,6 +149,11 @@ class Observer:
             return parameters[..., names.index("belt_speed")]
         return np.full(parameters.shape[:-1], self.ensemble.nominal.belt_speed)
 
+    @property
+    def velocity_may_drift(self) -> bool:
+        """Whether the velocity is not read but predicted by a plant that is itself estimated."""
+        return bool(self.ensemble.ranges) and self._seen == 1
+
     # Rows of guesses --------------------------------------------------------------------------------------------------
 
     @property
@@ -240,6 +245,11 @@ class AlphaBetaFilter(Observer):
 
     _ranges: ClassVar = {**Observer._ranges, "x_gain": (0.0, 2.0), "v_gain": (0.0, 2.0)}
     _SHARE: ClassVar = 0.9
+
+    @property
+    def velocity_may_drift(self) -> bool:
+        """False: no plant predicts it."""
+        return False
 
     def _blank(self, n: int) -> tuple[_Floats, _Floats]:
         return np.zeros((n, 1, self._width)), np.zeros((n, 0))

@@ -215,6 +215,41 @@ def test_a_belt_that_is_seen_by_its_position_alone_is_suppressed(kind, controlle
     assert table["suppressed"].mean() >= least
 
 
+def believed(x, v, step):
+    states = np.stack([np.atleast_1d(x), np.atleast_1d(v), np.full(np.size(x), 0.2)], axis=-1)[:, None]
+    return Belief(states, np.empty((np.size(x), 1, 0)), np.ones((np.size(x), 1)), np.full(np.size(x), step))
+
+
+def test_a_steady_error_of_the_velocity_leaves_the_rules_action_and_motion_stays():
+    env = make(randomise={}, sensor="position")
+    policy = ObservedRule.from_env(env, AlphaBetaFilter.from_env(env), blend_time=1.2)
+    times, state = 0.1 * np.arange(150), None
+    swing = 0.004 * np.sin(times), 0.004 * np.cos(times)
+    for t in range(150):  # a mass at rest, believed to creep; the same creep while it swings; one in large motion
+        x = np.array([0.8, 0.8 + swing[0][t], 0.8])
+        v = np.array([0.01, 0.01 + swing[1][t], 0.1])
+        actions, state = policy._decide(believed(x, v, t), state, None)
+        left = 0.01 * (11 / 12) ** t  # a first-order lag of 12 intervals
+        assert actions == pytest.approx(6.0 / 0.2 * np.array([left, left + swing[1][t], 0.1]), abs=1e-3)
+    fresh, _ = policy._decide(believed(x, v, 0), state, None)  # another episode
+    assert fresh == pytest.approx(6.0 / 0.2 * v)
+    with pytest.raises(ValueError, match=r"blend_time must be .* got 0"):
+        dataclasses.replace(policy, blend_time=0.0)
+
+
+def test_the_velocity_is_mended_where_an_estimated_plant_predicts_it():
+    known = {**BLIND, "randomise": {}}
+    for kind, arguments, expected in [
+        (EnsembleKalmanFilter, BLIND, 1.2),
+        (KalmanFilter, BLIND, 1.2),
+        (AlphaBetaFilter, BLIND, None),  # without a plant
+        (EnsembleKalmanFilter, {}, None),  # the velocity is read
+        (EnsembleKalmanFilter, known, None),  # the plant is known
+    ]:
+        env = make(**arguments)
+        assert ObservedRule.from_env(env, kind.from_env(env)).blend_time == expected
+
+
 @pytest.mark.parametrize(
     ("env_id", "kind", "least"), [(DRIFTING, EnsembleKalmanFilter, 0.85), (EXCITED, ParticleFilter, 0.6)]
 )
@@ -318,6 +353,5 @@ def test_look_ahead_leaves_the_rules_action_only_where_the_guesses_agree(monkeyp
             env, small(ParticleFilter, env), guesses=2, candidates=2, horizon=1, caution=caution
         )
         assert policy._decide(even, None, None)[0] == best
-    assert policy.rule.gain == 2.0 / env.unwrapped.task.belt_authority
     with pytest.raises(ValueError, match=r"caution must be .* got -1"):
         dataclasses.replace(policy, caution=-1.0)

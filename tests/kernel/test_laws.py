@@ -319,6 +319,18 @@ def test_the_slopes_that_events_are_looked_for_with_are_those_of_the_motion(geom
         assert slope == pytest.approx((high[0] - low[0]) / (2.0 * h), abs=1e-5)
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_gap_to_the_belt_is_looked_at_with_its_own_slope_and_curvature(side):
+    plant = random_plant(np.random.default_rng(19), "exact", "stribeck", ("force", "stiffness")).plant
+    surface, h = kernel.Surface(side, 0.2, 0.05, False), 1e-4
+    before, at, after = (
+        kernel.look_at(plant, -1, kernel.State(0.7, -0.3), kernel.Drive(0.2, 0.05, 0.03), t, surface)
+        for t in (-h, 0.0, h)
+    )
+    assert at.slope == pytest.approx((after.gap - before.gap) / (2.0 * h), abs=1e-5)
+    assert at.curvature == pytest.approx((after.slope - before.slope) / (2.0 * h), abs=1e-5)
+
+
 def test_time_zero_is_the_callers():
     rng = np.random.default_rng(14)
     for time in (0.7, 31.4, 500.0):

@@ -493,6 +493,10 @@ def test_a_mass_leaves_the_belt_each_way_where_that_directions_law_lets_it():
         excess = [kernel.cone_excess(p.plant, side, 0.1, kernel.Drive(0.1, 0.02, 0.0), t) for t in (0.0, 1e-6)]
         assert excess[0][0] == pytest.approx(side * 0.12 - p.plant.friction.breakaway_coefficient(mode), abs=1e-15)
         assert excess[0][1] == pytest.approx((excess[1][0] - excess[0][0]) / 1e-6, abs=1e-6)
+        # and where the normal force changes with the place, by that side's law
+        exact, drive = p.replace(geometry="exact").plant, kernel.Drive(0.1, 0.02, 0.0)
+        low, (_, slope), high = (kernel.cone_excess(exact, side, 0.6, drive, t) for t in (-1e-4, 0.0, 1e-4))
+        assert slope == pytest.approx((high[0] - low[0]) / 2e-4, abs=1e-6)
 
 
 SHARP = [

@@ -48,14 +48,15 @@ class ObservedPolicy:
 class ObservedRule(ObservedPolicy):
     """:class:`ThresholdFollower` at the believed mean velocity and nominal belt speed.
 
-    Where an estimated plant predicts the velocity, that has a steady error, which the rule would make a steady action.
-    The believed position has none, since it is read. While the rule is within its limits, a complementary filter
-    therefore takes the slow part of the velocity from the position's change::
+    A velocity that is predicted by a plant which is itself estimated may have a bias. The rule would make it a steady
+    action, and the belt would run off its speed. The believed position has no bias, since it is read. While the rule is
+    within its limits, a complementary filter therefore takes the slow part of the velocity from the position's change::
 
         bias += (mean v of the last interval - change of x / interval - bias) interval / blend_time
         action = rule at v - bias
 
-    Source: Higgins, 1975 (complementary filter).
+    Source: W. T. Higgins, A Comparison of Complementary and Kalman Filtering, IEEE Trans. Aerosp. Electron. Syst. 11
+    (1975) 321.
 
     Attributes:
         rule: its numbers; its belt speed is replaced by the believed one.
@@ -76,19 +77,19 @@ class ObservedRule(ObservedPolicy):
     def from_env(cls, env: Any, observer: Observer, **named: Any) -> Self:
         """Return the controller of an environment with an observer; ``named`` are numbers of the class.
 
-        ``blend_time`` is 1.2 where an estimated plant predicts the velocity.
+        ``blend_time`` is 1.2 where the observer's velocity may be biased, None elsewhere.
 
         Raises:
             ValueError: if the actuator is not the belt's speed or has no authority.
         """
-        blend_time = 1.2 if observer.velocity_may_drift else None
+        blend_time = 1.2 if observer.velocity_may_be_biased else None
         return cls(observer, **({"rule": ThresholdFollower.seeing_all(env), "blend_time": blend_time} | named))
 
     def _decide(self, belief: Belief, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
         states, parameters = belief.mean
-        now, belt_speed = states[..., :2], self.observer.belt_speed(parameters)
         if self.blend_time is None:
-            return self.rule.follow(now[..., 1], belt_speed), None
+            return self._follow(states, parameters), None
+        now, belt_speed = states[..., :2], self.observer.belt_speed(parameters)
         bias, before = (np.zeros(belief.steps.shape), now) if state is None else state
         interval, v = self.observer.ensemble.task.control_interval, now[..., 1]
         error = 0.5 * (v + before[..., 1]) - (now[..., 0] - before[..., 0]) / interval

@@ -150,7 +150,7 @@ class Observer:
         return np.full(parameters.shape[:-1], self.ensemble.nominal.belt_speed)
 
     @property
-    def velocity_may_drift(self) -> bool:
+    def velocity_may_be_biased(self) -> bool:
         """Whether the velocity is not read but predicted by a plant that is itself estimated."""
         return bool(self.ensemble.ranges) and self._seen == 1
 
@@ -247,8 +247,8 @@ class AlphaBetaFilter(Observer):
     _SHARE: ClassVar = 0.9
 
     @property
-    def velocity_may_drift(self) -> bool:
-        """False: no plant predicts it."""
+    def velocity_may_be_biased(self) -> bool:
+        """False: the velocity is from the readings alone."""
         return False
 
     def _blank(self, n: int) -> tuple[_Floats, _Floats]:

@@ -184,6 +184,24 @@ def test_the_clone_acts_as_its_teacher_and_its_critic_knows_its_returns():
         assert abs(buffer.returns.mean() - buffer.values.mean()) < 0.1 * abs(buffer.returns.mean())
 
 
+def test_a_run_clones_evaluates_and_then_fits_the_critic_before_its_first_step(tmp_path, monkeypatch):
+    done = []
+    for name in ("clone", "validate", "fit_critic"):
+        monkeypatch.setattr(training, name, noting(done, name, getattr(training, name)))
+    small = {"n_steps": 60, "samples": 200, "actor_steps": 50, "critic_steps": 20}
+    plan = warm_plan(timesteps=64, envs=4, overrides={"n_steps": 16}, eval_freq=64, warm=small)
+    training.train(plan, tmp_path / "run", progress=False)
+    assert done == ["clone", "validate", "fit_critic", "validate"]
+
+
+def noting(done, name, function):
+    def noted(*arguments):
+        done.append(name)
+        return function(*arguments)
+
+    return noted
+
+
 def test_a_run_started_from_a_controller_says_so_and_resumes_to_the_same_weights(tmp_path, capsys):
     small = {"n_steps": 60, "samples": 200, "actor_steps": 50, "critic_steps": 20}
     overrides = {"n_steps": 32, "n_epochs": 2}

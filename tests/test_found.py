@@ -189,6 +189,7 @@ LANDS_WITH_THE_SAMPLE = [
 ]
 
 
+@pytest.mark.parametrize("either_way", ["compiled"], indirect=True)  # a stiffness of frequency 966: minutes interpreted
 @pytest.mark.parametrize(("plant", "start", "kind"), LANDS_WITH_THE_SAMPLE)
 def test_a_landing_with_the_sample_is_listed(plant, start, kind):
     x, v, held = start

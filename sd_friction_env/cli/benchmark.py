@@ -49,7 +49,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     for parser_of, episodes in ((verify, len(protocol.SEEDS)), (plants, 50)):
         text = f"the first N of the protocol's (default: {episodes})"
         parser_of.add_argument("--episodes", type=int, default=episodes, metavar="N", help=text)
-    for parser_of in (run, table):
+    for parser_of in (run, verify, table):
         parser_of.add_argument("--task", nargs="+", choices=TASKS, default=TASKS, help="these only (default: all)")
         parser_of.add_argument("--tier", nargs="+", choices=_TIERS, default=_TIERS, help="these only (default: all)")
     for parser_of in (table, plants):
@@ -110,9 +110,13 @@ def _verify(options: argparse.Namespace) -> int:
     check_at_least(options, allow=0)
     entry = protocol.read_entry(options.entry)
     spec, different = options.policy or entry["policy"], []
-    for env_id in entry["environments"]:
+    env_ids = [env_id for env_id in _environments(options) if env_id in entry["environments"]]
+    if not env_ids:
+        has = ", ".join(entry["environments"])
+        raise UsageError(f"{str(options.entry)!r} has no results for --task and --tier; it has {has}")
+    for env_id in env_ids:
         protocol.check_environment(entry, env_id)
-    for env_id in entry["environments"]:
+    for env_id in env_ids:
         lines = protocol.differences(entry, env_id, agent_of(spec, env_id), options.episodes)
         print("\n  ".join([f"{env_id}: {len(lines) or 'no'} differences in {options.episodes} episodes", *lines]))
         different += [env_id] * (len(lines) > options.allow)

@@ -69,6 +69,10 @@ def test_a_strangers_policy_is_run_verified_and_ranked(mine, tmp_path, capsys):
     for path in ("a.json", "b.json"):
         assert main(["benchmark", "verify", path, "--episodes", "10"]) == 0
     assert "SDFriction/Force-v0: no differences in 10 episodes" in capsys.readouterr().out
+    assert main(["benchmark", "verify", "a.json", "--tier", "randomised", "--episodes", "1"]) == 0
+    assert capsys.readouterr().out == "SDFriction/ForceRandomised-v0: no differences in 1 episodes\n"
+    assert main(["benchmark", "verify", "a.json", "--tier", "blind"]) == 2
+    assert "'a.json' has no results for --task and --tier; it has SDFriction/Force-v0, " in capsys.readouterr().err
     assert main(["benchmark", "verify", "a.json", "--policy", f"{mine}:strong"]) == 1
     said = capsys.readouterr()
     assert "SDFriction/Force-v0: 101 differences in 100 episodes\n  seed 1000000: -" in said.out
@@ -182,12 +186,14 @@ def test_off_nominal_prints_a_line_for_each_plant(capsys):
     assert "--episodes must be in [1, 100], got 0" in capsys.readouterr().err
 
 
-# The look-ahead simulates the plant at every step: of it, one episode, and in the slow tests the others.
-EPISODES = [(path, "1" if "rollout" in path.stem else "20") for path in sorted((AGENTS / "entries").glob("*.json"))]
-EPISODES += [pytest.param(path, "20", marks=pytest.mark.slow) for path, episodes in EPISODES if episodes == "1"]
+ENTRIES = sorted((AGENTS / "entries").glob("*.json"))
+# The look-aheads simulate the plant at every step: of them one episode, and in the slow tests the others.
+QUICK = {"rollout": ["1"], "ensemble-rollout": ["1", "--tier", "blind"]}
+PARTS = [(path, QUICK.get(path.stem, ["20"])) for path in ENTRIES]
+PARTS += [pytest.param(path, ["20"], marks=pytest.mark.slow) for path in ENTRIES if path.stem in QUICK]
 
 
-@pytest.mark.parametrize(("path", "episodes"), EPISODES, ids=lambda value: getattr(value, "stem", value))
-def test_the_entries_of_the_package_are_what_their_controllers_reach(path, episodes):
-    assert main(["benchmark", "verify", str(path), "--episodes", episodes]) == 0
+@pytest.mark.parametrize(("path", "part"), PARTS, ids=lambda value: getattr(value, "stem", None))
+def test_the_entries_of_the_package_are_what_their_controllers_reach(path, part):
+    assert main(["benchmark", "verify", str(path), "--episodes", *part]) == 0
     assert path.stat().st_size < 15_000

@@ -240,12 +240,14 @@ def test_the_last_info_and_observation_are_of_the_moment_at_which_contact_is_los
     env = make(**arguments)
     rng, lost = np.random.default_rng(0), 0
     for seed in range(24):
+        if lost == 3:
+            break
         observation, info = env.reset(seed=seed)
         if info["normal_force"] <= 0.0:
             continue  # a random start may lie where there is no contact
-        steps, terminated, truncated = 0, False, False
-        while not (terminated or truncated):
-            observation, _, terminated, truncated, info = env.step(rng.uniform(-1, 1, 1).astype(np.float32))
+        steps, terminated = 0, False
+        while not terminated and steps < 20:
+            observation, _, terminated, _, info = env.step(rng.uniform(-1, 1, 1).astype(np.float32))
             steps += 1
         if not terminated:
             continue

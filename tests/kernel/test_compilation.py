@@ -322,7 +322,14 @@ child.join()
 """
 
 
-@pytest.mark.parametrize("before", [["Push", "Place"], ["Push", "Push Place"], ["forked Push", "forked Place"]])
+@pytest.mark.parametrize(
+    "before",
+    [
+        ["Push", "Place"],
+        pytest.param(["Push", "Push Place"], marks=pytest.mark.slow),
+        pytest.param(["forked Push", "forked Place"], marks=pytest.mark.slow),
+    ],
+)
 def test_code_that_two_processes_compiled_under_one_name_keeps_its_own_constants(before, tmp_path):
     (tmp_path / "makers.py").write_text(MAKERS)
 

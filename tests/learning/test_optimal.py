@@ -63,10 +63,10 @@ def test_optimum_beats_simple_controllers_from_every_start(env_id):
     optimum = stored_returns(env_id, seeds)
     problem = optimal.make_problem(env_id, seeds)
     shape = (len(seeds), problem.steps)
-    for action in (0.0, -1.0, -0.5, 0.5, 1.0):
+    for action in (0.0, -1.0, 0.5):
         assert np.all(optimum > problem.returns(np.full(shape, action))), f"constant action {action}"
     sign = 1.0 if problem.belt_moves else -1.0
-    for gain in (-5.0, 0.5, 1.0, 2.0, 5.0, 20.0):
+    for gain in (-5.0, 1.0, 5.0):
         feedback = sum_of_rewards(problem, lambda s, k=gain: np.clip(sign * k * s[:, 1], -1.0, 1.0))
         assert np.all(optimum > feedback), f"velocity feedback, gain {gain}"
 

@@ -511,7 +511,7 @@ sys.exit(main(["train", *sys.argv[2:]]))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
-@pytest.mark.parametrize("room", [0, 3000, 10000])
+@pytest.mark.parametrize("room", [0, 3000, pytest.param(10000, marks=pytest.mark.slow)])
 def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(whole, room, tmp_path, capsys):
     words = [sys.executable, "-c", FULL, str(room), *command(tmp_path / "run")]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)

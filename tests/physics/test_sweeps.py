@@ -242,7 +242,7 @@ def test_a_dask_worker_killed_in_mid_run_loses_nothing(tmp_path, expected):
 
 def test_the_program_is_interrupted_and_goes_on(tmp_path):
     folder, out = tmp_path / "kept", tmp_path / "curve.csv"
-    arguments = ["amplitude", "--alpha", "0.2:1:0.005", "--belt-speed", "0.01:0.6:0.005", "--folder", str(folder)]
+    arguments = ["amplitude", "--alpha", "0.2:1:0.01", "--belt-speed", "0.01:0.6:0.01", "--folder", str(folder)]
     command = [sys.executable, "-m", "sd_friction_env", *arguments, "--out", str(out)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as program:
         until(lambda: len(finished(folder)) >= 3 if folder.is_dir() else False, "three chunks are finished")

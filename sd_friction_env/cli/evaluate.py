@@ -39,9 +39,9 @@ suppressed: share of the episodes that end still (amplitude under 5% of passive)
 Score and suppressed have 95% intervals over the episodes. Amplitude, reduction, stick and belt speed are of the last
 half of the episodes; settling is the mean time of those that settle; residual is the rms action of the last quarter; ms
 is the wall time of one decision for one environment. --controller classical stands for all classical controllers that
-were tuned for the environment. alpha-beta, particle, ensemble and kalman are observers, with the rule of
-threshold-follower, its rollout, or the trained agent that sees the state: each but alpha-beta knows the model, the
-ranges of the hidden parameters, and the sensor's noise and delay."""
+were tuned for the environment. alpha-beta, luenberger, particle, ensemble and kalman are observers, with the
+rule of threshold-follower, its rollout, or the trained agent that sees the state: luenberger knows the nominal model
+and the sensor's delay, the last three also the ranges of the hidden parameters and the noise."""
 
 GRID_TEXT = """\
 The episodes of `sd-friction evaluate` for every plant of the grid. --backend and --address say where it runs; the

@@ -1,4 +1,6 @@
-"""Controllers that act on what an observer believes: the rule, its look-ahead, and trained networks."""
+"""Controllers that act on what an observer believes: the rule, its look-ahead, and trained networks. Then the rule and
+its look-ahead as an environment's observations allow them.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any, Self
@@ -6,8 +8,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sd_friction_env.control.observers import Belief, Observer
-from sd_friction_env.control.policies import Actions, Policy, State, ThresholdFollower
+from sd_friction_env.control.observers import Belief, LuenbergerObserver, Observer
+from sd_friction_env.control.policies import (
+    Actions,
+    EstimatingFollower,
+    Policy,
+    RolloutPolicy,
+    State,
+    ThresholdFollower,
+)
 from sd_friction_env.control.policies.lookahead import pick
 from sd_friction_env.control.policies.policy import as_taken
 from sd_friction_env.physics.parameters import checked_count, checked_number
@@ -174,3 +183,36 @@ class ObservedNetwork(ObservedPolicy):
         observation = np.clip(np.stack(seen, axis=-1), -limit, limit).astype(np.float32)
         actions, state = self.policy.predict(observation, state, starts)
         return np.asarray(actions, np.float64)[..., 0], state
+
+
+def threshold_follower(env: Any) -> Policy:
+    """Return the rule that an environment's observations allow, with the numbers of the package.
+
+    Args:
+        env: an :class:`SDFrictionEnv` with the belt actuator, wrapped or not. :class:`ObservedRule` on the nominal
+            plant's :class:`LuenbergerObserver` is for the sensor "position", :class:`EstimatingFollower` for
+            environments that draw ``belt_speed``, :class:`ThresholdFollower` for all others.
+
+    Raises:
+        TypeError: if it is another kind of environment.
+        ValueError: if its actuator is not the belt's speed or has no authority.
+    """
+    task = getattr(getattr(env, "unwrapped", None), "task", None)
+    if getattr(task, "sensor", None) == "position":
+        return ObservedRule.from_env(env, LuenbergerObserver.from_env(env))
+    if "belt_speed" in getattr(task, "randomise", {}):
+        return EstimatingFollower.from_env(env)
+    return ThresholdFollower.from_env(env)
+
+
+def rollout_follower(env: Any) -> Policy:
+    """Return the look-ahead controller of an environment: the rollout of the rule on the nominal plant.
+
+    Where the sensor sees the position only, it acts on the state of the :class:`LuenbergerObserver`.
+
+    Raises:
+        TypeError, ValueError: as :func:`threshold_follower`.
+    """
+    if isinstance(threshold_follower(env), ObservedRule):
+        return ObservedRollout.from_env(env, LuenbergerObserver.from_env(env))
+    return RolloutPolicy.from_env(env, ThresholdFollower.from_env(env))

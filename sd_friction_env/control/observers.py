@@ -201,11 +201,15 @@ class Observer:
     def _step(
         self, guesses: _Floats, actions: _Floats, spread: _Floats, steps: NDArray[np.int64]
     ) -> tuple[_Floats, _Floats]:
-        now = guesses[..., : self._first]
+        now = self._stepped(guesses[..., : self._first], actions, steps)
+        return self._row(now, guesses[..., self._first :]), spread
+
+    def _stepped(self, now: _Floats, actions: _Floats, steps: NDArray[np.int64]) -> _Floats:
+        """Return states and hidden parameters (n, k, d) a control interval after ``steps`` (n,) intervals."""
         ends, _ = self.ensemble.step(now[..., :3], now[..., 3:], actions, steps[:, None])
         # A guess that cannot be advanced stays where it is.
         ends = np.where(np.isfinite(ends).all(axis=-1, keepdims=True), ends, now[..., :3])
-        return self._row(np.concatenate([ends, now[..., 3:]], axis=-1), guesses[..., self._first :]), spread
+        return np.concatenate([ends, now[..., 3:]], axis=-1)
 
     # Of each observer -------------------------------------------------------------------------------------------------
 
@@ -289,6 +293,58 @@ class AlphaBetaFilter(Observer):
             target = (1.0 + task.belt_authority * actions) * self.belt_speed(now[..., 3:])
             now[..., 2] += np.clip(target - now[..., 2], -most, most)
         return self._row(now, guesses[..., self._first :]), spread
+
+
+@dataclass(frozen=True)
+class LuenbergerObserver(Observer):
+    """State of the nominal plant, corrected by two constant gains; hidden parameters are taken for nominal.
+
+    It keeps the state of the time at which the sensor took its reading. With the reading's deviation e, x moves by
+    x_gain e and v by v_gain e; the actions since then advance the result over the delay. An episode begins at the
+    belt's speed, because a squealing mass sticks for part of each cycle; a model that starts at rest takes longer to
+    find the velocity. Source: D. G. Luenberger, An Introduction to Observers, IEEE Trans. Autom. Control 16 (1971) 596.
+
+    Attributes:
+        x_gain: share of the deviation, in [0, 2].
+        v_gain: velocity per displacement, in [0, 1e6].
+    """
+
+    x_gain: float = 0.27
+    v_gain: float = 0.18
+
+    _ranges: ClassVar = {**Observer._ranges, "x_gain": (0.0, 2.0), "v_gain": (0.0, 1e6)}
+
+    def _blank(self, n: int) -> tuple[_Floats, _Floats]:
+        """Return arrays for guesses, and for states at the readings' time with the actions since, oldest first."""
+        return np.zeros((n, 1, self._width)), np.zeros((n, self._first + self.ensemble.task.sensor_delay))
+
+    def _begin(self, reading: _Floats) -> tuple[_Floats, _Floats]:
+        nominal = self.ensemble.nominal
+        now = np.full((len(reading), 1, self._first), nominal.belt_speed)
+        now[..., : self._seen] = reading[:, None, : self._seen]
+        now[..., 3:] = [nominal.values[name] for name, _ in self.ensemble.ranges]
+        return self._row(now), np.pad(now[:, 0], ((0, 0), (0, self.ensemble.task.sensor_delay)))
+
+    def _update(
+        self, reading: _Floats, guesses: _Floats, spread: _Floats, steps: NDArray[np.int64]
+    ) -> tuple[_Floats, _Floats]:
+        error = reading[:, 0] - spread[:, 0]
+        spread[:, 0] += self.x_gain * error
+        spread[:, 1] += self.v_gain * error
+        now, actions = spread[:, None, : self._first], spread[:, self._first :]
+        for i, action in enumerate(actions.T):
+            now = self._stepped(now, action[:, None], steps - len(actions.T) + i)
+        guesses[..., : self._first] = now
+        return guesses, spread
+
+    def _step(
+        self, guesses: _Floats, actions: _Floats, spread: _Floats, steps: NDArray[np.int64]
+    ) -> tuple[_Floats, _Floats]:
+        ends, _ = super()._step(guesses, actions, spread, steps)
+        read, since = spread[:, : self._first], np.concatenate([spread[:, self._first :], actions], axis=-1)
+        passed = steps - self.ensemble.task.sensor_delay
+        moved = self._stepped(read[:, None], since[:, :1], np.maximum(passed, 0))[:, 0]
+        return ends, np.concatenate([np.where(passed[:, None] < 0, read, moved), since[:, 1:]], axis=-1)
 
 
 @dataclass(frozen=True)

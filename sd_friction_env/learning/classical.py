@@ -6,6 +6,7 @@ suppressed episodes is stored with it.
 """
 
 import contextlib
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +21,8 @@ import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env import ENVIRONMENT_IDS, SDFrictionEnv
+from sd_friction_env.control.observed import ObservedRule
+from sd_friction_env.control.observers import LuenbergerObserver
 from sd_friction_env.control.policies import (
     Actions,
     DelayedFeedback,
@@ -27,7 +30,6 @@ from sd_friction_env.control.policies import (
     EstimatingFollower,
     FilteredFeedback,
     LinearFeedback,
-    ObservingFollower,
     Policy,
     Readings,
     ScheduledFeedback,
@@ -154,6 +156,12 @@ def _follower(kind: type[ThresholdFollower], env: SDFrictionEnv, values: Sequenc
     return kind.from_env(env, 10.0 ** values[0], *values[1:])
 
 
+def _observed(env: SDFrictionEnv, values: Sequence[float]) -> Policy:
+    gain, threshold, x_gain, v_gain = values
+    rule = dataclasses.replace(ThresholdFollower.seeing_all(env), gain=10.0**gain, threshold=threshold)
+    return ObservedRule.from_env(env, LuenbergerObserver.from_env(env, x_gain=x_gain, v_gain=v_gain), rule=rule)
+
+
 def _gain(unit: float) -> Range:
     """Return the range of a gain in units of the gain that turns an observation of 1 into an action of 1.
 
@@ -258,7 +266,7 @@ KINDS: dict[str, Kind] = {
         functools.partial(_follower, EstimatingFollower), lambda env: _FOLLOWS, actuator="belt_speed"
     ),
     "threshold follower, observer": Kind(
-        functools.partial(_follower, ObservingFollower),
+        _observed,
         lambda env: {**_FOLLOWS, **_CORRECTIONS},
         needs_velocity=False,
         actuator="belt_speed",

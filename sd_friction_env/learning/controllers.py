@@ -11,11 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sd_friction_env.control.observed import ObservedNetwork, ObservedPolicy, ObservedRollout, ObservedRule
+from sd_friction_env.control.observed import (
+    ObservedNetwork,
+    ObservedPolicy,
+    ObservedRollout,
+    ObservedRule,
+    rollout_follower,
+    threshold_follower,
+)
 from sd_friction_env.control.observers import (
     AlphaBetaFilter,
     EnsembleKalmanFilter,
     KalmanFilter,
+    LuenbergerObserver,
     Observer,
     ParticleFilter,
 )
@@ -25,8 +33,6 @@ from sd_friction_env.control.policies import (
     SamplingPolicy,
     State,
     load_policy,
-    rollout_follower,
-    threshold_follower,
 )
 from sd_friction_env.control.pretrained import load_pretrained, recurrent_follower
 from sd_friction_env.environments.ids import environment_id
@@ -36,6 +42,7 @@ from sd_friction_env.learning.optimal import OptimalPolicy
 
 _OBSERVERS: dict[str, type[Observer]] = {
     "alpha-beta": AlphaBetaFilter,
+    "luenberger": LuenbergerObserver,
     "particle": ParticleFilter,
     "ensemble": EnsembleKalmanFilter,
     "kalman": KalmanFilter,

@@ -1,22 +1,16 @@
 """The belt that follows the mass below a threshold: actions by hand, memory, and how well it suppresses."""
 
-import dataclasses
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from sd_friction_env.control.policies import (
-    EstimatingFollower,
-    ObservingFollower,
-    ThresholdFollower,
-    ZeroPolicy,
-    threshold_follower,
-)
+from sd_friction_env.control.observed import ObservedRule, threshold_follower
+from sd_friction_env.control.observers import LuenbergerObserver
+from sd_friction_env.control.policies import EstimatingFollower, ThresholdFollower, ZeroPolicy
 from sd_friction_env.learning import evaluation
 
 BELT, RANDOMISED, SENSED = (f"SDFriction/BeltSpeed{tier}-v0" for tier in ("", "Randomised", "Sensed"))
-FOLLOWERS = {BELT: ThresholdFollower, RANDOMISED: EstimatingFollower, SENSED: ObservingFollower}
+FOLLOWERS = {BELT: ThresholdFollower, RANDOMISED: EstimatingFollower, SENSED: ObservedRule}
 STARTS = evaluation.VALIDATION_SEEDS[:24]
 
 
@@ -76,46 +70,6 @@ def test_the_estimate_is_the_largest_ratio_until_one_repeats():
     assert act(policy, [observe(env, *one) for one in faster + sticks + rests])[-1] == pytest.approx(0.5, abs=1e-6)
 
 
-@pytest.mark.parametrize("delay", [0, 1, 3])
-def test_the_observer_follows_a_plant_that_it_knows(delay):
-    """Without noise and from the right start, its prediction over the delay is the plant's state, to rounding."""
-    env = make(SENSED, sensor_noise=0.0, sensor_delay=delay)
-    policy = ObservingFollower.from_env(env)
-    direct = ThresholdFollower.from_env(make(), policy.gain, policy.threshold)
-    observation, info = env.reset(seed=0, options={"x": 0.3, "v": env.nominal.belt_speed})
-    state = None
-    for t in range(120):
-        action, state = policy.predict(observation, state, t == 0)
-        assert action == pytest.approx(direct.predict(observe(make(), info["v"]))[0], abs=1e-4), t
-        observation, _, _, _, info = env.step(action)
-
-
-def test_the_observer_corrects_its_model_by_the_reading():
-    env = make(SENSED, sensor_noise=0.0, sensor_delay=0)
-    policy = ObservingFollower.from_env(env, 6.0, 1.1, 0.25, 0.5)
-    first, second = (np.array([x], np.float32) for x in (0.3, 0.5))
-    _, state = policy.predict(first)
-    places = policy.readings.x_offset + env.task.x_scale * np.array([0.3, 0.5], np.float32).astype(float)
-    model = env.nominal, (places[0], 0.2, 0.2)
-    expected = _stepped(env, model, -1.0)
-    assert state[0] == pytest.approx(expected, abs=1e-9)
-    difference = places[1] - expected[0]
-    corrected = expected + difference * np.array([0.25, 0.5, 0.0])
-    action, state = policy.predict(second, state, False)
-    wanted = np.clip(6.0 * corrected[1] / 0.2, -1.0, 1.0) if corrected[1] < 0.11 else -1.0
-    assert action == pytest.approx([wanted], abs=1e-6)
-    assert state[0] == pytest.approx(_stepped(env, (env.nominal, corrected), float(action[0])), abs=1e-9)
-
-
-def _stepped(env, model, action):
-    """The state that the environment itself reaches in a control interval."""
-    _, (x, v, v_belt) = model
-    env.reset(seed=0, options={"x": float(x), "v": float(v)})
-    env.set_state(dataclasses.replace(env.get_state(), v_belt=float(v_belt)))
-    _, _, _, _, info = env.step(np.array([action], np.float32))
-    return np.array([info["x"], info["v"], info["v_belt"]])
-
-
 @pytest.mark.parametrize("env_id", FOLLOWERS)
 def test_followers_act_alike_alone_and_in_batches_and_forget_an_episode_that_ended(env_id):
     env = make(env_id)
@@ -171,9 +125,6 @@ def test_a_start_faster_than_the_belt_does_not_deceive_a_follower_that_waits():
         (lambda: EstimatingFollower.from_env(make(SENSED)), "needs the velocity; this sensor sees the position only"),
         (lambda: ThresholdFollower.from_env(make(), -1.0), r"gain must be .* got -1.0"),
         (lambda: ThresholdFollower.from_env(make(), 6.0, float("nan")), r"threshold must be .* got nan"),
-        (lambda: ObservingFollower.from_env(make(SENSED), x_correction=3.0), r"x_correction must be .* got 3.0"),
-        (lambda: ObservingFollower.from_env(make(SENSED), v_correction=-0.1), r"v_correction must be .* got -0.1"),
-        (lambda: ObservingFollower.from_env(make(SENSED), sensor_delay=0.5), "sensor_delay must be a whole number"),
         (lambda: ThresholdFollower.from_env(make(belt_authority=0.0)), r"belt_authority must be|belt_authority > 0"),
     ],
 )
@@ -194,7 +145,7 @@ def test_a_follower_that_waits_runs_the_belt_slow_until_the_mass_sticks():
 
 
 def test_a_follower_needs_one_of_our_environments():
-    for build in (ThresholdFollower.from_env, ObservingFollower.from_env, threshold_follower):
+    for build in (ThresholdFollower.from_env, LuenbergerObserver.from_env, threshold_follower):
         with pytest.raises(TypeError, match="must be an SDFrictionEnv"):
             build(gym.make("CartPole-v1"))
 

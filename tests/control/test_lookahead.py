@@ -4,7 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sd_friction_env.control.policies import Model, RolloutPolicy, ThresholdFollower, rollout_follower
+from sd_friction_env.control.observed import rollout_follower
+from sd_friction_env.control.policies import Model, RolloutPolicy, ThresholdFollower
 from sd_friction_env.environments.single import make_env
 from sd_friction_env.learning import evaluation
 

@@ -13,8 +13,10 @@ from sd_friction_env.control.observers import (
     Belief,
     EnsembleKalmanFilter,
     KalmanFilter,
+    LuenbergerObserver,
     ParticleFilter,
 )
+from sd_friction_env.control.policies import ThresholdFollower
 from sd_friction_env.environments.ensemble import Ensemble
 from sd_friction_env.learning import evaluation
 
@@ -22,7 +24,7 @@ NOMINAL, RANDOMISED, SENSED, DRIFTING, EXCITED = (
     f"SDFriction/BeltSpeed{tier}-v0" for tier in ("", "Randomised", "Sensed", "Drifting", "Excited")
 )
 BLIND = {"sensor": "position", "sensor_noise": 0.005, "sensor_delay": 1}
-FILTERS = [AlphaBetaFilter, ParticleFilter, EnsembleKalmanFilter, KalmanFilter]
+FILTERS = [AlphaBetaFilter, LuenbergerObserver, ParticleFilter, EnsembleKalmanFilter, KalmanFilter]
 SMALL = {"prior_size": 512}
 # A fast belt and starts near the equilibrium: the mass never sticks.
 SLIPS = {"parameters": {"belt_speed": 0.6}, "start": "random", "x_offset": 0.84, "x_scale": 0.02, "v_scale": 0.02}
@@ -33,7 +35,7 @@ def make(env_id=RANDOMISED, **arguments):
 
 
 def small(kind, env, **named):
-    return kind.from_env(env, **({} if kind is AlphaBetaFilter else SMALL), **named)
+    return kind.from_env(env, **({} if kind in FILTERS[:2] else SMALL), **named)
 
 
 def follow(observer, env, steps, seed=2_000_000, amplitude=1.0):
@@ -198,6 +200,46 @@ def test_the_belief_is_weighted():
     assert belief.mean[1][0] == 3.0
 
 
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_the_luenberger_observer_follows_a_plant_that_it_knows(delay):
+    """Without noise and from the right start, its prediction over the delay is the plant's state, to rounding."""
+    env = make(SENSED, sensor_noise=0.0, sensor_delay=delay)
+    observer = LuenbergerObserver.from_env(env)
+    observation, info = env.reset(seed=0, options={"x": 0.3, "v": env.nominal.belt_speed})
+    memory, rule = None, ThresholdFollower.seeing_all(env)
+    for t in range(120):
+        belief, memory = observer.correct(observation, memory, t == 0)
+        truth = info["x"], info["v"], info["v_belt"]
+        assert belief.states[0] == pytest.approx(truth, abs=1e-6), t
+        action = np.float32(np.clip(rule.follow(belief.states[0, 1], 0.2), -1.0, 1.0))
+        memory = observer.advance(memory, action)
+        observation, _, _, _, info = env.step(action[None])
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_the_luenberger_observer_corrects_what_it_believed_when_the_reading_was_taken(delay):
+    env = make(SENSED, sensor_noise=0.0, sensor_delay=delay)
+    observer = LuenbergerObserver.from_env(env, x_gain=0.25, v_gain=0.5)
+    plant = Ensemble(env.nominal, env.task)
+    _, memory = observer.correct(np.array([0.3], np.float32))
+    first, second = (env.task.x_offset + env.task.x_scale * float(np.float32(x)) for x in (0.3, 0.5))
+    state, actions = np.array([first, 0.2, 0.2]), (-1.0, 0.5, 0.8)[: delay + 1]
+    for action in actions[:-1]:  # the sensor still repeats its first reading
+        memory = observer.advance(memory, action)
+        _, memory = observer.correct(np.array([0.3], np.float32), memory, False)
+    memory = observer.advance(memory, actions[-1])
+    belief, _ = observer.correct(np.array([0.5], np.float32), memory, False)
+
+    def step(state, action):
+        return plant.step(state, np.empty(0), np.array(action))[0]
+
+    state = step(state, actions[0])
+    state = state + (second - state[0]) * np.array([0.25, 0.5, 0.0])
+    for action in actions[1:]:
+        state = step(state, action)
+    assert belief.states[0] == pytest.approx(state, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("kind", "controller", "least"),
     [
@@ -292,6 +334,7 @@ def test_phases_are_close_to_each_other_across_a_full_turn():
         (lambda: KalmanFilter.from_env(make(), inflation=0.5), r"inflation must be .* got 0.5"),
         (lambda: KalmanFilter.from_env(make(), noise=0.0), r"noise must be .* got 0.0"),
         (lambda: AlphaBetaFilter.from_env(make(), x_gain=float("nan")), r"x_gain must be .* got nan"),
+        (lambda: LuenbergerObserver.from_env(make(), v_gain=-0.1), r"v_gain must be .* got -0.1"),
         (
             lambda: ObservedRule.from_env(
                 make("SDFriction/ForceSensed-v0"), KalmanFilter.from_env(make("SDFriction/ForceSensed-v0"))

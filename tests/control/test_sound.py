@@ -7,7 +7,8 @@ from scipy.io import wavfile
 from sd_friction_env import OscillatorParameters, limit_cycle, simulate
 from sd_friction_env.cli.main import main
 from sd_friction_env.control import sound
-from sd_friction_env.control.policies import ConstantPolicy, ZeroPolicy, threshold_follower
+from sd_friction_env.control.observed import threshold_follower
+from sd_friction_env.control.policies import ConstantPolicy, ZeroPolicy
 from sd_friction_env.environments.single import make_env
 from sd_friction_env.physics import signals
 from sd_friction_env.physics.orbits import OrbitError

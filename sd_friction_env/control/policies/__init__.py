@@ -19,13 +19,7 @@ from sd_friction_env.control.policies.feedback import (
     SlidingMode,
     VelocityFeedback,
 )
-from sd_friction_env.control.policies.follower import (
-    EstimatingFollower,
-    ObservingFollower,
-    ThresholdFollower,
-    rollout_follower,
-    threshold_follower,
-)
+from sd_friction_env.control.policies.follower import EstimatingFollower, ThresholdFollower
 from sd_friction_env.control.policies.lookahead import LookAhead, Model, RolloutPolicy
 from sd_friction_env.control.policies.network import NetworkPolicy, PolicyFileError, load_policy
 from sd_friction_env.control.policies.planning import GradientPolicy, SamplingPolicy
@@ -45,7 +39,6 @@ __all__ = [
     "LookAhead",
     "Model",
     "NetworkPolicy",
-    "ObservingFollower",
     "Policy",
     "PolicyFileError",
     "Readings",
@@ -61,6 +54,4 @@ __all__ = [
     "VelocityFeedback",
     "ZeroPolicy",
     "load_policy",
-    "rollout_follower",
-    "threshold_follower",
 ]

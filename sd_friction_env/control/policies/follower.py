@@ -1,16 +1,15 @@
-"""A belt that follows the mass below a threshold: a rule of two numbers found from the optimum, and what to do where
-the belt's speed or the velocity is not known.
+"""A belt that follows the mass below a threshold: a rule of two numbers found from the optimum, also for a hidden belt
+speed.
 """
 
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sd_friction_env.control.policies.feedback import Feedback, Readings
-from sd_friction_env.control.policies.lookahead import Model, RolloutPolicy
-from sd_friction_env.control.policies.policy import State, as_taken, broadcast_starts, checked_memory, remembered
+from sd_friction_env.control.policies.policy import State, remembered
 
 _Floats = NDArray[np.float64]
 
@@ -140,111 +139,3 @@ def estimate_belt_speed(
         estimate = np.where(stuck, estimate, np.maximum(estimate, ratio))
     estimate = np.where(sticks, ratio, estimate)
     return estimate, (ratio, estimate, stuck)
-
-
-@dataclass(frozen=True)
-class ObservingFollower(ThresholdFollower):
-    """:class:`ThresholdFollower` on the state of an observer, for sensors that see a noisy, delayed position alone.
-
-    The observer advances the nominal plant by the environment's own step under the actions taken. At each reading it
-    compares the position with that which the model had when the sensor took it, corrects the model's x by x_correction
-    and its v by v_correction times the difference, and predicts over the delay. It begins at the belt's speed,
-    because a squealing mass sticks for part of each cycle; a model that starts at rest takes longer to find the
-    velocity.
-
-    Attributes:
-        x_correction: share of the difference, in [0, 2].
-        v_correction: velocity per displacement, in [0, 1e6].
-        model: of the plant.
-        sensor_delay: in control intervals.
-        rollout: None, or the look-ahead controller that acts on the observed state in place of the rule.
-    """
-
-    x_correction: float = 0.27
-    v_correction: float = 0.18
-    _: KW_ONLY
-    model: Model = field(repr=False)
-    sensor_delay: int
-    rollout: RolloutPolicy | None = field(default=None, repr=False)
-
-    _ranges: ClassVar = {
-        **ThresholdFollower._ranges,
-        "x_correction": (0.0, 2.0),
-        "v_correction": (0.0, 1e6),
-        "sensor_delay": (0.0, 1000.0),
-    }
-    _needs_velocity = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.sensor_delay != int(self.sensor_delay):
-            raise ValueError(f"sensor_delay must be a whole number, got {self.sensor_delay!r}")
-        object.__setattr__(self, "sensor_delay", int(self.sensor_delay))
-
-    @classmethod
-    def _known(cls, env: Any) -> dict[str, Any]:
-        return super()._known(env) | {"model": Model.from_env(env), "sensor_delay": env.task.sensor_delay}
-
-    def _act(self, values: _Floats, state: State, starts: ArrayLike | None) -> tuple[_Floats, State]:
-        x = values[..., 0] + self.readings.x_equilibrium
-        # The model's state when the sensor took this reading, and the actions since then (NaN: before the episode).
-        belt_speed = np.full_like(x, self.belt_speed)
-        model = np.stack([x, belt_speed, belt_speed], axis=-1)
-        actions = np.full((*x.shape, self.sensor_delay), np.nan)
-        if state is not None:
-            begun = broadcast_starts(starts, x)[..., None]
-            memory = checked_memory(state, model.shape, actions.shape)
-            model, actions = (np.where(begun, new, old) for new, old in zip((model, actions), memory, strict=True))
-        difference = x - model[..., 0]
-        corrections = (self.x_correction, self.v_correction, 0.0)
-        steps = [model + np.stack([gain * difference for gain in corrections], axis=-1)]
-        for i in range(self.sensor_delay):
-            steps.append(self._advance(steps[-1], actions[..., i]))
-        now = steps[-1]
-        wanted = self.rollout.best_actions(now) if self.rollout else self.follow(now[..., 1], self.belt_speed)
-        action = as_taken(wanted)
-        actions = np.concatenate([actions, action[..., None]], axis=-1)
-        if not self.sensor_delay:
-            steps.append(self._advance(steps[0], action))
-        return action, (steps[1], actions[..., 1:])
-
-    def _advance(self, states: _Floats, actions: _Floats) -> _Floats:
-        """Return the model's states (x, v, v_belt), shape (..., 3), a control interval later; unchanged at NaN."""
-        ends, _ = self.model.step(states, np.nan_to_num(actions))
-        # A model that cannot be advanced stays as it is, until readings have corrected it.
-        valid = np.isfinite(actions) & np.isfinite(ends).all(axis=-1)
-        return np.where(valid[..., None], ends, states)
-
-
-def threshold_follower(env: Any) -> ThresholdFollower:
-    """Return the follower that an environment's observations allow, with the numbers of the package.
-
-    Args:
-        env: an :class:`SDFrictionEnv` with the belt actuator, wrapped or not. The observer is for the sensor
-            "position", the estimated belt speed for environments that draw ``belt_speed``.
-
-    Raises:
-        TypeError: if it is another kind of environment.
-        ValueError: if its actuator is not the belt's speed or has no authority.
-    """
-    task = getattr(getattr(env, "unwrapped", None), "task", None)
-    if getattr(task, "sensor", None) == "position":
-        return ObservingFollower.from_env(env)
-    if "belt_speed" in getattr(task, "randomise", {}):
-        return EstimatingFollower.from_env(env)
-    return ThresholdFollower.from_env(env)
-
-
-def rollout_follower(env: Any) -> Feedback:
-    """Return the look-ahead controller of an environment: the rollout of its :func:`threshold_follower`.
-
-    It knows the nominal plant. Where the sensor sees the position only, it acts on the observer's state.
-
-    Raises:
-        TypeError, ValueError: as :func:`threshold_follower`.
-    """
-    follower = threshold_follower(env)
-    if not isinstance(follower, ObservingFollower):
-        return RolloutPolicy.from_env(env, ThresholdFollower.from_env(env))
-    rule = ThresholdFollower.seeing_all(env)
-    return replace(follower, rollout=RolloutPolicy(rule, readings=rule.readings, model=follower.model))

@@ -80,6 +80,9 @@ class Ensemble:
         ends = state[kernel.STATE_X : kernel.STATE_X + 3].T.reshape(states.shape)
         return ends, rewards.reshape(actions.shape)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Ensemble, (self.nominal, self.task)  # without the compiled code
+
     @functools.cached_property
     def _fixed(self) -> tuple[Any, ...]:
         """What all steps share: kind and example of the plants, their compiled code and tables, the task in arrays."""

@@ -1,6 +1,7 @@
 """Observers against what they should find: the true state and plant, a textbook filter, and each other."""
 
 import dataclasses
+import pickle
 
 import gymnasium as gym
 import numpy as np
@@ -160,6 +161,15 @@ def policies_on(env, kind):
     network = load_pretrained(RANDOMISED)
     rule, rollout = (each.from_env(env, observer) for each in (ObservedRule, ObservedRollout))
     return [rule, dataclasses.replace(rollout, horizon=5), ObservedNetwork(observer, network)]
+
+
+def test_an_ensemble_is_copied_without_its_compiled_code():
+    ensemble = Ensemble(make().nominal, make().task)
+    given = np.array([0.8, 0.1, 0.2]), np.array([0.2, 0.8, 0.05]), np.array(0.5)
+    (state, reward), copied = ensemble.step(*given), pickle.dumps(ensemble)
+    assert len(copied) < 5_000
+    again, same = pickle.loads(copied).step(*given)
+    assert (again.tobytes(), same) == (state.tobytes(), reward)
 
 
 @pytest.mark.parametrize("kind", FILTERS)

@@ -1,5 +1,5 @@
-"""Controllers that act on what an observer believes: the rule, its look-ahead, and trained networks. Then the rule and
-its look-ahead as an environment's observations allow them.
+"""Controllers that act on what an observer believes: the rule, its look-ahead, and any policy that sees the state. Then
+the rule and its look-ahead as an environment's observations allow them.
 """
 
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ _Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class ObservedPolicy:
+class Observed:
     """Base: corrects an observer by each observation, decides on its belief, and advances it by the action.
 
     Attributes:
@@ -54,7 +54,7 @@ class ObservedPolicy:
 
 
 @dataclass(frozen=True)
-class ObservedRule(ObservedPolicy):
+class ObservedRule(Observed):
     """:class:`ThresholdFollower` at the believed mean velocity and nominal belt speed.
 
     A velocity that is predicted by a plant which is itself estimated may have a bias. The rule would make it a steady
@@ -163,8 +163,8 @@ class ObservedRollout(ObservedRule):
 
 
 @dataclass(frozen=True)
-class ObservedNetwork(ObservedPolicy):
-    """A policy that reads the whole state, as the trained agents do, on the believed mean.
+class ObservedPolicy(Observed):
+    """A policy that reads the whole state, such as a planner or a trained agent, on the believed mean.
 
     Attributes:
         policy: of an environment with the sensor "state" and the same scales.

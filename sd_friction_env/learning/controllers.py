@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sd_friction_env.control.observed import (
-    ObservedNetwork,
+    Observed,
     ObservedPolicy,
     ObservedRollout,
     ObservedRule,
@@ -49,12 +49,12 @@ _OBSERVERS: dict[str, type[Observer]] = {
 }
 
 
-def _observed(observer: str, controller: str, env: Any) -> ObservedPolicy:
+def _observed(observer: str, controller: str, env: Any) -> Observed:
     """Return the rule, its look-ahead or the trained agent ("rule", "rollout", "agent") on an observer of a name."""
     found = _OBSERVERS[observer].from_env(env)
     if controller == "agent":
         tier = "randomised" if "belt_speed" in found.ensemble.names else "nominal"
-        return ObservedNetwork(found, load_pretrained(environment_id("belt", tier)))
+        return ObservedPolicy(found, load_pretrained(environment_id("belt", tier)))
     return (ObservedRule if controller == "rule" else ObservedRollout).from_env(env, found)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sd_friction_env import load_pretrained
-from sd_friction_env.control.observed import ObservedNetwork, ObservedRollout, ObservedRule
+from sd_friction_env.control.observed import ObservedPolicy, ObservedRollout, ObservedRule, threshold_follower
 from sd_friction_env.control.observers import (
     AlphaBetaFilter,
     Belief,
@@ -20,6 +20,7 @@ from sd_friction_env.control.observers import (
 from sd_friction_env.control.policies import ThresholdFollower
 from sd_friction_env.environments.ensemble import Ensemble
 from sd_friction_env.learning import evaluation
+from sd_friction_env.learning.optimal import OptimalPolicy
 
 NOMINAL, RANDOMISED, SENSED, DRIFTING, EXCITED = (
     f"SDFriction/BeltSpeed{tier}-v0" for tier in ("", "Randomised", "Sensed", "Drifting", "Excited")
@@ -160,7 +161,7 @@ def policies_on(env, kind):
     observer = small(kind, env)
     network = load_pretrained(RANDOMISED)
     rule, rollout = (each.from_env(env, observer) for each in (ObservedRule, ObservedRollout))
-    return [rule, dataclasses.replace(rollout, horizon=5), ObservedNetwork(observer, network)]
+    return [rule, dataclasses.replace(rollout, horizon=5), ObservedPolicy(observer, network)]
 
 
 def test_an_ensemble_is_copied_without_its_compiled_code():
@@ -265,6 +266,15 @@ def test_a_belt_that_is_seen_by_its_position_alone_is_suppressed(kind, controlle
     policy = controller.from_env(make(**BLIND), kind.from_env(make(**BLIND)))
     table = evaluation.evaluate(policy, RANDOMISED, starts, BLIND)
     assert table["suppressed"].mean() >= least
+
+
+def test_a_planner_acts_on_an_observer_where_it_does_not_see_the_state():
+    starts, env = evaluation.VALIDATION_SEEDS[:4], make(SENSED)
+    planner = OptimalPolicy.from_env(make(NOMINAL))
+    on_observer = ObservedPolicy(LuenbergerObserver.from_env(env), planner)
+    planned, rule = (evaluation.evaluate(each, SENSED, starts) for each in (on_observer, threshold_follower(env)))
+    assert planned["suppressed"].all()
+    assert (planned["return"] > rule["return"]).all()
 
 
 def believed(x, v, step):

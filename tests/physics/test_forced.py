@@ -103,7 +103,13 @@ SALTATION = {
 }
 
 
-@pytest.mark.parametrize("name", SALTATION)
+# Each law alone is compiled in the slow tests; in the quick ones, some together.
+ALONE = ("exponential", "hyperbolic", "cubic", "duffing", "alpha = 0")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in ALONE else name for name in SALTATION]
+)
 def test_the_tangent_map_is_what_differences_of_the_automaton_say(name):
     p, (x, v), wanted = SALTATION[name]
     rng = np.random.default_rng(1)

@@ -206,6 +206,7 @@ def test_a_reward_one_bit_off_in_a_batch_is_found(monkeypatch):
     assert failure_of(environments.batch_trial, 0, 1) == "batch"
 
 
+@pytest.mark.slow
 def test_another_answer_of_interpreted_code_is_found(monkeypatch):
     right = environments.fingerprints
 
@@ -235,6 +236,7 @@ def test_an_attractor_that_attracts_nothing_is_found(monkeypatch):
     assert failure_of(motions.attractor_trial, 0, 0) == "attracts nothing"
 
 
+@pytest.mark.slow
 def test_a_multiplier_that_depends_on_the_section_is_found(monkeypatch):
     right = motions.forced_orbit
 

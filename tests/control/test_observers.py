@@ -212,9 +212,10 @@ def test_the_belief_is_weighted():
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3])
-def test_the_luenberger_observer_follows_a_plant_that_it_knows(delay):
+@pytest.mark.parametrize("plant", [{}, {"force_amplitude": 0.05, "force_frequency": 1.3}])
+def test_the_luenberger_observer_follows_a_plant_that_it_knows(delay, plant):
     """Without noise and from the right start, its prediction over the delay is the plant's state, to rounding."""
-    env = make(SENSED, sensor_noise=0.0, sensor_delay=delay)
+    env = make(SENSED, sensor_noise=0.0, sensor_delay=delay, parameters=plant)
     observer = LuenbergerObserver.from_env(env)
     observation, info = env.reset(seed=0, options={"x": 0.3, "v": env.nominal.belt_speed})
     memory, rule = None, ThresholdFollower.seeing_all(env)

@@ -45,7 +45,7 @@ class Observer:
 
     A guess is one row: x, v, v_belt, the hidden parameters, and the x (and v, if it is read) of the last
     ``sensor_delay`` + 1 intervals, oldest first. A reading then corrects the whole row by its oldest part, so that no
-    prediction over the delay is needed.
+    prediction over the delay is needed. (Only the Luenberger observer corrects the past and predicts.)
 
     Attributes:
         ensemble: of the plants that are possible, with the task.

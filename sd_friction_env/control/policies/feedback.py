@@ -17,7 +17,7 @@ GAINS = (-1e9, 1e9)
 
 
 def nearest_equilibrium(parameters: OscillatorParameters, x: float) -> float:
-    """Return the steady-slip equilibrium, without excitation, that is nearest to the position x; x where there is none."""
+    """Return the steady-slip equilibrium, without excitation, that is nearest to x; x where there is none."""
     return min((place.x for place in equilibria(parameters.unexcited)), key=lambda place: abs(place - x), default=x)
 
 
